@@ -77,8 +77,8 @@ def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[
     left = all(_at_noise(one, quiet[one.search.axis]) for one in found)
     if not left or not acting <= {one.search.axis for one in supported}:
         return ""
-    best, names = supported[0].search.best.lags, state.model.plant.table.layout.responses
-    return f"sums of {best} lags follow {listed([names[one.search.axis].name for one in supported])} as well"
+    names = state.model.plant.table.layout.responses
+    return f"{supported[0].said} follow {listed([names[one.search.axis].name for one in supported])} as well"
 
 
 def _at_noise(one: Alternative, quiet: int) -> bool:

@@ -375,7 +375,7 @@ def _findings(
         scatter=first.scatter,
         missed=None if by_record else missed(study, after.fit, now, searched.state),
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
-        risen=risen(was, now) if study.held_out and not by_record else np.nan,
+        risen=np.nan if by_record else risen(was, now),
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )

@@ -122,9 +122,8 @@ class Findings:
     """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
     nothing: no such records, no such error, or effects that differ from record to record."""
     risen: float = math.nan
-    """Largest error of any axis on held-out records with the effects over that without [-]; NaN without such
-    records, or with effects that differ from record to record: those of a held-out one are unknown, so that
-    either error is chance."""
+    """Largest error of any axis on unseen records with the effects over that without [-]; NaN with effects
+    that differ from record to record: those of an unseen one are unknown, so that either error is chance."""
     dynamics: bool = False
     """Whether linear dynamics without a name were added."""
     apart: bool = True
@@ -189,10 +188,13 @@ def _refused(given: Findings) -> str:
             "effect. No name is forced; more `terms`, or `share` and `delay` by path in [model], may help."
         )
     if not given.effects:
+        why = "no effect of the library survives a full refit"
+        if given.generic > given.largest - MARGIN:
+            why = f"{given.generic_name} describes it as well as any effect of the library"
         return (
             f"Something is missing (log Bayes factor {given.largest:.0f} nat against {given.threshold:.1f} "
-            f"by chance), and the residual is {given.excess:.2f} times the noise; but no effect of the "
-            "library survives a full refit: no name is forced."
+            f"by chance), and the residual is {given.excess:.2f} times the noise; but {why}: no name is "
+            "forced."
         )
     nearest = f"The nearest effect ({', '.join(given.effects)})"
     if given.remaining > given.remaining_threshold:
@@ -213,7 +215,7 @@ def _refused(given: Findings) -> str:
         )
     if given.risen > RISEN:
         return (
-            f"{nearest} takes up what the fitted records leave, but the error on the records held out is "
+            f"{nearest} takes up what the fitted records leave, but the error on unseen records is "
             f"{given.risen:.2f} times as large with it: no name is forced."
         )
     return ""

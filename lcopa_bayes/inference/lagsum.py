@@ -39,6 +39,8 @@ _PER_DECADE = 10
 _SHORTEST, _LONGEST = 0.5, 3.0
 """Time constants between this share of a sampling period and this multiple of the span of the records [-]:
 what is slower cannot be told from a drift."""
+_INSTANT = 0.02
+"""Shortest time constant that is tabulated, for lags that are part of a diffusion [sampling period]."""
 WEIGHT = 1.0
 """Prior standard deviation of a weight, in ranges of response over ranges of drive [-]."""
 _VISIBLE = 1e-4
@@ -68,13 +70,16 @@ class LagTable:
     delays: Matrix
     """Tabulated delays of every path, equally spaced, (paths, delays) [time unit]."""
     responses: Array
-    """In the directions that are kept, (paths, times, delays, directions) [per unit weight]."""
+    """Of lags, and perhaps of what the first component of a path is in place of one, in the directions that
+    are kept, (1 or 2, paths, times, delays, directions) [per unit weight]."""
     target: Vector
     """The record, (directions,)."""
     remainder: float
     """Its squared part in no direction [-]."""
     size: int
     """Samples behind it [-]."""
+    shortest: float
+    """Natural logarithm of the shortest time constant of a component [time unit]."""
 
     @property
     def paths(self) -> int:
@@ -84,7 +89,7 @@ class LagTable:
     def ends(self, lags: int) -> tuple[Vector, Vector]:
         """Smallest and largest coordinates of paths of so many lags: log times path by path, then delays."""
         count = self.paths * lags
-        low = np.concatenate([np.full(count, self.log_times[0]), self.delays[:, 0]])
+        low = np.concatenate([np.full(count, self.shortest), self.delays[:, 0]])
         high = np.concatenate([np.full(count, self.log_times[-1]), self.delays[:, -1]])
         return low, high
 
@@ -102,14 +107,16 @@ class LagTable:
         along = (delays - self.delays[:, 0]) / (self.delays[:, 1] - self.delays[:, 0])
         before = np.clip(np.floor(along).astype(int), 0, self.delays.shape[1] - 2)[..., None]
         share = along[..., None] - before
-        tabulated = self.responses.shape[:3]
-        place = tabulated[2] * (tabulated[1] * np.arange(self.paths)[:, None] + first) + before
-        around = tabulated[2] * np.arange(4)[:, None] + np.arange(2)
-        weights = np.stack(_cubic(at - first), axis=-1)[..., None]
+        kinds, _, times, nodes = self.responses.shape[:4]
+        kind = np.where(np.arange(log_times.shape[2]), 0, kinds - 1)
+        place = nodes * (times * (self.paths * kind + np.arange(self.paths)[:, None]) + first) + before
+        around = nodes * np.arange(4)[:, None] + np.arange(2)
+        weights = np.stack(cubic(at - first), axis=-1)[..., None]
         weights = weights * np.stack([1 - share, share], axis=-1)[..., None, :]
-        nodes, each = (place[..., None, None] + around).ravel(), np.arange(place.size + 1) * around.size
-        by_node = csr_array((weights.ravel(), nodes, each), shape=(place.size, np.prod(tabulated)))
-        out = by_node @ self.responses.reshape(-1, self.target.size)  # nothing is copied for a node
+        flat = self.responses.reshape(-1, self.target.size)
+        taken, each = (place[..., None, None] + around).ravel(), np.arange(place.size + 1) * around.size
+        by_node = csr_array((weights.ravel(), taken, each), shape=(place.size, len(flat)))
+        out = by_node @ flat  # nothing is copied for a node
         return np.asarray(out).reshape(len(coordinates), -1, self.target.size)
 
     def conditional(self, coordinates: Matrix) -> Conditional:
@@ -231,7 +238,7 @@ def best_of(fits: Sequence[LagFit]) -> LagFit:
 
 
 def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
-    nodes = table.log_times[2:-2]
+    nodes = table.log_times[table.log_times >= table.shortest][2:-2]
     if fewer is None:
         low, high = table.delays[:, 0], table.delays[:, -1]
         places = np.quantile(nodes, (0.25, 0.5, 0.75))
@@ -276,7 +283,7 @@ def _descended(table: LagTable, lags: int, start: Vector) -> LagFit:
     return LagFit(lags, optimum.x, np.asarray(optimum.jac), square, table.size)
 
 
-def _cubic(at: Array) -> tuple[Array, ...]:
+def cubic(at: Array) -> tuple[Array, ...]:
     """Lagrange weights of nodes 0, 1, 2 and 3."""
     a, b, c = at - 1, at - 2, at - 3
     return -a * b * c / 6, at * b * c / 2, -at * a * c / 2, at * a * b / 6
@@ -313,7 +320,7 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
     """
     posterior, scales = problem.posterior, problem.scales
     assert isinstance(posterior.noise, GaussianNoise)
-    first, last = np.log(_SHORTEST * scales.period), np.log(_LONGEST * scales.span)
+    first, last = np.log(_INSTANT * scales.period), np.log(_LONGEST * scales.span)
     log_times = np.linspace(first, last, max(8, round(_PER_DECADE * (last - first) / np.log(10)) + 1))
     offsets = [k for k in posterior.table.of_kind("offset") if posterior.table.rows[k].response == axis]
     offsets = [k for k in offsets if posterior.table.rows[k].free]
@@ -338,8 +345,9 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
         joined = joined - (joined @ basis) @ basis.T
     reduced, target = _reduced(joined[:count], joined[-1])
     remainder = max(0.0, float(joined[-1] @ joined[-1] - target @ target))
-    shape = (len(drives), log_times.size, delays.shape[1], -1)
-    return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, joined.shape[1])
+    shape = (1, len(drives), log_times.size, delays.shape[1], -1)
+    shortest = float(np.log(_SHORTEST * scales.period))
+    return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, joined.shape[1], shortest)
 
 
 def _columns(problem: Problem, axis: int, drives: Sequence[int], values: Matrix) -> list[Matrix]:

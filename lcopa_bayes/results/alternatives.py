@@ -98,9 +98,9 @@ class Alternatives:
                 out.append(
                     Limitation(
                         "tentative",
-                        f"a sum of {one.search.best.lags} lags follows {paths} better than the fitted plant "
+                        f"{one.said} follow {paths} better than the fitted plant "
                         f"(AIC lower by {one.advantage:.0f})",
-                        "read figures of the step responses, which are of the sum of lags, and let `compare` "
+                        "read figures of the step responses, which are of these lags, and let `compare` "
                         "weigh other structures",
                     )
                 )

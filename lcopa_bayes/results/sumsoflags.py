@@ -24,7 +24,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
-from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, lag_draws
+from lcopa_bayes.sampling.lagdraws import LagMixture, LagSearch, likely
 
 _SUPPORT = 10.0
 """Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
@@ -32,6 +32,8 @@ _RISEN = 0.3
 """Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
 _STREAM = 17
 """Marks the randomness of these draws."""
+
+_DIFFUSIONS = {"wall": "through a wall", "layer": "into a layer"}
 
 Support = Literal["plant", "both", "lags"]
 
@@ -43,13 +45,19 @@ class Alternative:
 
     paths: tuple[PathSlot, ...]
     """Those whose drive moves and whose gain is not known."""
-    search: LagSearch
+    searches: tuple[LagSearch, ...]
+    """Of each kind that follows the records about as well as the best, which is first."""
     advantage: float
     """Akaike's criterion of the fitted plant less that of the lags [-]."""
     square: float
     """Whitened residual of the fitted plant, squared [-]."""
     seed: int
     """Of the draws."""
+
+    @property
+    def search(self) -> LagSearch:
+        """The best by BIC."""
+        return self.searches[0]
 
     @property
     def support(self) -> Support:
@@ -59,14 +67,22 @@ class Alternative:
         return "lags" if self.advantage > 0 else "plant"
 
     @cached_property
-    def draws(self) -> LagDraws:
+    def draws(self) -> LagMixture:
         """Drawn where they are asked for."""
-        return lag_draws(self.search, self.seed)
+        return LagMixture.of(self.searches, self.seed)
 
     @property
     def ess(self) -> float | None:
         """Effective sample size of the draws [-]; None where the records give the lags no support."""
         return None if self.support == "plant" else self.draws.ess
+
+    @property
+    def said(self) -> str:
+        """What they are."""
+        best, most = self.search.best.lags, self.search.lags
+        if self.search.kind == "lags":
+            return f"sums of {best} to {most} lags"
+        return f"diffusion {_DIFFUSIONS[self.search.kind]} and up to {most - 1} lag{'s' * (most > 2)}"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values of the search."""
@@ -74,6 +90,7 @@ class Alternative:
         times = np.exp(best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
         return {
             "paths": [one.name for one in self.paths],
+            "kind": self.search.kind,
             "lags": best.lags,
             "times": [sorted(row) for row in times.tolist()],
             "aic_advantage": self.advantage,
@@ -128,7 +145,7 @@ def sentence_of(found: Sequence[Alternative]) -> str:
         "plant": "do not follow the records as well as the fitted plant does",
     }
     return " ".join(
-        f"Sums of {one.search.best.lags} to {one.search.lags} lags"
+        f"{one.said[0].upper()}{one.said[1:]}"
         f"{f' for {listed([path.name for path in one.paths])}' if len(found) > 1 else ''} "
         f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by {abs(one.advantage):.1f})."
         for one in found
@@ -206,10 +223,11 @@ def _alternative(plant: FittedPlant, problem: Problem, axis: int, paths: tuple[P
         square += float((posterior.noise.standard(residual, noise[None], observed.gaps) ** 2).sum())
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 10 * _STREAM + axis
-    search = LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends)
+    searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends))
     parameters = _parameters(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
-    advantage = square + 2 * parameters - search.best.square - 2 * search.best.parameters
-    return Alternative(paths, search, advantage, square, seed)
+    best = searches[0].best
+    advantage = square + 2 * parameters - best.square - 2 * best.parameters
+    return Alternative(paths, searches, advantage, square, seed)
 
 
 def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:

@@ -1,8 +1,9 @@
 """Draws of the sums of lags that a response axis may be: times and delays, and exactly their weights.
 
 The number of lags is the best by BIC and one more, which the records need not show: what it leaves open of a
-number is part of that number's interval. Delays are tabulated over all that is asked first and then where
-they are.
+number is part of that number's interval. A diffusion may stand in place of the first lag of each path, where
+it follows the records as well (`inference.diffusion`). Delays are tabulated over all that is asked first and
+then where they are.
 
 One path has so few coordinates that importance sampling from a mixture holds, which is fitted to the draws of
 all its forerunners; these are fitted to powers of the density that rise to 1, so that ridges are followed to
@@ -21,8 +22,9 @@ import emcee
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.diffusion import KINDS, Kind, diffused, rises
 from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, best_of, lag_fits, lag_table
 from lcopa_bayes.sampling.importanceweights import usable_k
 from lcopa_bayes.sampling.mixture import Mixture
@@ -32,7 +34,9 @@ from lcopa_bayes.sampling.weighted import resampled, tail_smoothed
 _COARSE, _FINE = 17, 33
 """Delays tabulated over all that is asked, and where they are."""
 _NEAR = 20.0
-"""BIC above the least of a number of lags whose delay is still looked at [-]."""
+"""BIC above the least of a number of lags, or of a kind, which is still looked at [-]."""
+_LIKELY = 10.0
+"""BIC above the least of a kind up to which it has an equal part in the draws [-]."""
 _REACH = 10.0
 """Standard deviations of a delay that are tabulated on either side [-]."""
 _POWERS = (0.05, 0.1, 0.3, 1.0, 1.0)
@@ -69,19 +73,35 @@ class LagSearch:
     """Ends between which delays are uniform, (paths, 2) [time unit]."""
     near: Matrix
     """Those between which they are tabulated, (paths, 2) [time unit]."""
+    kind: Kind = "lags"
+    """What the first component of a path is."""
 
     @classmethod
     def over(
-        cls, problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix
-    ) -> LagSearch:
-        """A search over all delays between their ends (paths, 2) [time unit], and again where they are."""
+        cls,
+        problem: Problem,
+        axis: int,
+        drives: Sequence[int],
+        noise: Vector,
+        delays: Matrix,
+        kinds: Sequence[Kind] = KINDS,
+    ) -> tuple[LagSearch, ...]:
+        """Searches over all delays between their ends (paths, 2) [time unit], and again where they are, of
+        every kind that may follow the records best."""
         table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
-        return cls(problem, axis, tuple(drives), noise, delays, _near(table, lag_fits(table), delays))
+        fits = {kind: lag_fits(diffused(table, kind)) for kind in kinds}
+        least = min(best_of(own).bic for own in fits.values())
+        return tuple(
+            cls(problem, axis, tuple(drives), noise, delays, _near(table, own, delays), kind)
+            for kind, own in fits.items()
+            if best_of(own).bic < least + _NEAR
+        )
 
     @cached_property
     def table(self) -> LagTable:
         """Responses of the delays that are tabulated."""
-        return lag_table(self.problem, self.axis, self.drives, self.noise, _nodes(self.near, _FINE))
+        lags = lag_table(self.problem, self.axis, self.drives, self.noise, _nodes(self.near, _FINE))
+        return diffused(lags, self.kind)
 
     @cached_property
     def fits(self) -> tuple[LagFit, ...]:
@@ -98,12 +118,19 @@ class LagSearch:
         """Lags of the draws: one more than the best has, where there may be so many."""
         return min(self.best.lags + 1, MOST)
 
+    @property
+    def apart(self) -> int:
+        """Components of a path that are no lags as all others [-]."""
+        return int(self.kind != "lags")
+
 
 @final
 @dataclass(frozen=True, eq=False)
 class LagDraws:
     """Equally probable sums of lags of the paths of one response axis."""
 
+    kind: Kind
+    """What the first of them is."""
     times: Array
     """Time constants, (draws, paths, lags) [time unit]."""
     weights: Array
@@ -121,26 +148,73 @@ class LagDraws:
     def response(self, path: int, time: Vector) -> Matrix:
         """Response to a unit step at time 0, (draws, n)."""
         since = np.maximum(time - self.delays[:, path, None], 0.0)
+        times, weights = self.times[:, path, :, None], self.weights[:, path, :, None]
         out = np.zeros(since.shape)
-        for k in range(self.times.shape[2]):
-            out -= self.weights[:, path, k, None] * np.expm1(-since / self.times[:, path, k, None])
+        for k in range(times.shape[1]):
+            out += weights[:, k] * rises("lags" if k else self.kind, since, times[:, k])
         return out
 
 
-def lag_draws(search: LagSearch, seed: int) -> LagDraws:
-    """Draws about the optima of a search, tabulated farther out where they stand beside an end."""
+@final
+@dataclass(frozen=True, eq=False)
+class LagMixture:
+    """Equally probable draws of several kinds, in no order."""
+
+    parts: tuple[LagDraws, ...]
+    picked: Index
+    """Places of the draws among those of all parts, (draws,)."""
+
+    @classmethod
+    def of(cls, searches: Sequence[LagSearch], seed: int) -> LagMixture:
+        """As many draws of each search."""
+        rng = np.random.default_rng([seed, 1])
+        drawn = [lag_draws(one, seed, _WANTED / len(searches)) for one in searches]
+        sizes = np.array([len(one.delays) for one in drawn])
+        each = zip(np.cumsum(sizes) - sizes, sizes, strict=True)
+        picked = [first + rng.choice(size, sizes.min(), replace=False) for first, size in each]
+        return cls(tuple(drawn), rng.permutation(np.concatenate(picked)))
+
+    @cached_property
+    def gains(self) -> Matrix:
+        """Steady response per unit step, (draws, paths)."""
+        return np.asarray(np.concatenate([one.gains for one in self.parts])[self.picked])
+
+    @cached_property
+    def delays(self) -> Matrix:
+        """(draws, paths) [time unit]."""
+        return np.asarray(np.concatenate([one.delays for one in self.parts])[self.picked])
+
+    @property
+    def ess(self) -> float:
+        """Effective sample size of all, as the least of any kind allows [draws]."""
+        return len(self.parts) * min(one.ess for one in self.parts)
+
+    def response(self, path: int, time: Vector) -> Matrix:
+        """Response to a unit step at time 0, (draws, n)."""
+        return np.asarray(np.concatenate([one.response(path, time) for one in self.parts])[self.picked])
+
+
+def likely(searches: Sequence[LagSearch]) -> tuple[LagSearch, ...]:
+    """Those that follow the records about as well as the best by BIC, which is first."""
+    ranked = sorted(searches, key=lambda one: one.best.bic)
+    return tuple(one for one in ranked if one.best.bic < ranked[0].best.bic + _LIKELY)
+
+
+def lag_draws(search: LagSearch, seed: int, wanted: float = _WANTED) -> LagDraws:
+    """Draws about the optima of a search, effectively as many as are `wanted`, tabulated farther out where
+    they stand beside an end."""
     rng = np.random.default_rng(seed)
-    kept, ess = _sampled(search, rng)
+    kept, ess = _sampled(search, rng, wanted)
     wider = _wider(search, kept)
     while (wider != search.near).any():
         search = replace(search, near=wider)
-        kept, ess = _sampled(search, rng)
+        kept, ess = _sampled(search, rng, wanted)
         wider = _wider(search, kept)
     log_times, own = search.table.parts(kept)
     scales = search.problem.scales
     units = scales.amplitude[search.axis] / scales.excursion[list(search.drives)]
     weights = search.table.conditional(kept).draw(rng).reshape(log_times.shape) * units[:, None]
-    return LagDraws(np.exp(log_times), weights, own, ess)
+    return LagDraws(search.kind, np.exp(log_times), weights, own, ess)
 
 
 def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
@@ -166,22 +240,22 @@ def _wider(search: LagSearch, draws: Matrix) -> Matrix:
     return np.stack([low, np.where(above, np.minimum(near[:, 1] + width, delays[:, 1]), near[:, 1])], axis=1)
 
 
-def _sampled(search: LagSearch, rng: np.random.Generator) -> tuple[Matrix, float]:
+def _sampled(search: LagSearch, rng: np.random.Generator, wanted: float) -> tuple[Matrix, float]:
     """Coordinates of equally probable draws, (draws, dimension), and their effective number."""
     begun = _begun(search, rng)
-    weighted = _weighted(search.table, begun, rng) if search.table.paths == 1 else None
-    return weighted or _walked(search.table, begun, rng)
+    weighted = _weighted(search, begun, rng) if search.table.paths == 1 else None
+    return weighted or _walked(search, begun, rng, wanted)
 
 
-def _weighted(table: LagTable, proposal: Mixture, rng: np.random.Generator) -> tuple[Matrix, float] | None:
+def _weighted(search: LagSearch, proposal: Mixture, rng: np.random.Generator) -> tuple[Matrix, float] | None:
     """By importance sampling, which a first proposal begins; None where it does not hold."""
-    seen = _joined(Seen(), table, proposal, rng)
+    seen = _joined(Seen(), search, proposal, rng)
     for power in _POWERS:
         density, log_weights = np.concatenate(seen.log_densities), seen.log_weights()
         known = np.isfinite(density)
         log_weights[known] -= (1 - power) * density[known]
         proposal = adapted(np.concatenate(seen.points), log_weights, int(rng.integers(2**31)))
-        seen = _joined(seen, table, proposal, rng)
+        seen = _joined(seen, search, proposal, rng)
     log_weights = seen.log_weights()
     smooth, k = tail_smoothed(log_weights)
     ess = _DRAWN * seen.efficiency(proposal, log_weights)  # of the last alone, by what all have met
@@ -190,17 +264,20 @@ def _weighted(table: LagTable, proposal: Mixture, rng: np.random.Generator) -> t
     return np.concatenate(seen.points)[resampled(smooth, _KEPT, rng)], 1 / (1 / ess + 1 / _KEPT)
 
 
-def _joined(seen: Seen, table: LagTable, proposal: Mixture, rng: np.random.Generator) -> Seen:
+def _joined(seen: Seen, search: LagSearch, proposal: Mixture, rng: np.random.Generator) -> Seen:
     """With draws of a proposal. Lags have no names: those whose times do not increase have no density."""
-    y = proposal.draw(_DRAWN, rng)
-    ordered = (np.diff(table.parts(y)[0], axis=2) >= 0).all(axis=(1, 2))
+    table, y = search.table, proposal.draw(_DRAWN, rng)
+    ordered = (np.diff(table.parts(y)[0][..., search.apart :], axis=2) >= 0).all(axis=(1, 2))
     density = np.full(len(y), -np.inf)
     density[ordered] = table.log_density(y[ordered])
     return seen.joined(proposal, len(y), y, density)
 
 
-def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[Matrix, float]:
+def _walked(
+    search: LagSearch, begun: Mixture, rng: np.random.Generator, wanted: float = _WANTED
+) -> tuple[Matrix, float]:
     """By emcee."""
+    table = search.table
     low, high = table.ends((begun.dimension - table.paths) // table.paths)
     position = begun.draw(max(_WALKERS, 4 * low.size), rng)
     inside = (position > low) & (position < high)
@@ -213,7 +290,7 @@ def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[
         state = sampler.run_mcmc(state, _STEPS)
         chain = sampler.get_chain()[_THIN - 1 :: _THIN].swapaxes(0, 1)
         ess = _ess(table, chain)
-        if ess >= _WANTED:
+        if ess >= wanted:
             break
     kept = chain.reshape(-1, low.size)
     return kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)], ess
@@ -260,7 +337,9 @@ def _begun(search: LagSearch, rng: np.random.Generator) -> Mixture:
     means, factors = [], []
     for centre, covariance in zip(centres, covariances, strict=True):
         log_times, delays = table.parts(np.arange(float(low.size))[None])
-        ranks = np.argsort(table.parts(centre[None])[0], axis=2)
+        times = np.array(table.parts(centre[None])[0])
+        times[..., : search.apart] = -np.inf  # stays first
+        ranks = np.argsort(times, axis=2)
         order = np.append(np.take_along_axis(log_times, ranks, axis=2).ravel(), delays).astype(int)
         shrunk = np.minimum(1.0, widest / np.maximum(np.sqrt(np.diag(covariance)), 1e-300))
         covariance = covariance * np.outer(shrunk, shrunk) + np.diag((1e-2 * widest) ** 2)

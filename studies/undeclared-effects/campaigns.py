@@ -8,7 +8,7 @@ from typing import Any
 
 import foreign
 import numpy as np
-from devicetruth import place, side_figures, size_deviations, step_deviations
+from devicetruth import place, side_figures, size_deviations, steady_truth, step_deviations
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.hiddeneffects import Hidden, MarchError
@@ -155,11 +155,11 @@ def judged(found: Loop, made: Campaign | foreign.Foreign) -> dict[str, Any]:
 def scored(found: Loop, made: Campaign) -> dict[str, Any]:
     """Places of gains, delays and figures of the device, and of the sizes of its effects [normal sd]."""
     return {
-        "plant_before": deviations(found.before, made)
+        "plant_before": deviations(found, made, found.before)
         | step_deviations(side_figures(found, found.before), found, made),
-        "plant_alone": deviations(found.after, made)
+        "plant_alone": deviations(found, made, found.after)
         | step_deviations(found.figures, found, made, alone=True),
-        "plant_after": deviations(found.after, made, found) | step_deviations(found.figures, found, made),
+        "plant_after": deviations(found, made) | step_deviations(found.figures, found, made),
         "sizes_after": size_deviations(found, made),
     }
 
@@ -183,21 +183,20 @@ def errors(side: Side, made: Campaign | foreign.Foreign) -> dict[str, float]:
     }
 
 
-def deviations(side: Side, made: Campaign, open_to: Loop | None = None) -> dict[str, float]:
-    """Gains and delay less those of the device, on the scale they are sampled on, by name [posterior sd];
-    of a loop over the effects that are open to it, where the true value lies among its values [normal sd]."""
-    model, out = side.state.model, {}
-    sd = np.sqrt(np.diag(side.state.covariance))
+def deviations(found: Loop, made: Campaign, alone: Side | None = None) -> dict[str, float]:
+    """Where the gains and the delay of the device lie among the values of a loop, by name [normal sd]; of one
+    side `alone`, less its own, on the scale that they are sampled on [posterior sd]."""
+    state, out, steady = (alone or found.after).state, {}, steady_truth(found, made)
+    model, sd = state.model, np.sqrt(np.diag(state.covariance))
     for k in range(model.plant_size):
         row = model.posterior.table.rows[model.columns[k]]
         if row.kind not in ("gain", "delay"):
             continue
-        path = made.device.paths[row.place.first][row.place.second] if row.kind == "gain" else None
-        truth = path.steady if path is not None else made.device.paths[0][0].delay
-        if open_to is None:
-            out[row.name] = float((side.state.optimum.x[k] - row.coordinate(truth)) / sd[k])
+        truth = float(steady[row.place]) if row.kind == "gain" else made.device.paths[0][0].delay
+        if alone is not None:
+            out[row.name] = float((state.optimum.x[k] - row.coordinate(truth)) / sd[k])
         else:
-            out[row.name] = place(open_to.number(k).values, truth)
+            out[row.name] = place(found.number(k).values, truth)
     return out
 
 

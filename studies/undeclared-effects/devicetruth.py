@@ -9,16 +9,23 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from lcopa_bayes.bench.hiddeneffects import Hidden
+from lcopa_bayes.bench.command import step
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.hiddeneffects import Hidden, HiddenDevice
 from lcopa_bayes.bench.inversion import unit_step
-from lcopa_bayes.bench.undeclared import LARGEST, Campaign
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.bench.undeclared import LARGEST, Campaign, shot_of
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.openeffects import Weighed, mixture
 from lcopa_bayes.model.path import TransferPath
 
 _FINE = 4001
 """Points at which a step response is looked at for where it crosses a level first."""
+_LATE = 1e4
+"""When what an effect adds has ended [longest record]."""
+LINEAR = ("overdrive_pulse", "ion_creep", "extra_mode", "missing_cross_path", "sensor_lag", "exposure")
+"""Effects that are linear and do not change with time: where they are not named they are part of the response
+that was measured, which no record of it can tell apart."""
 UNSCORED = {
     "trigger_jitter": "a number for every record, drawn by chance",
     "pointing_offset": "a number for every record, drawn by chance",
@@ -132,22 +139,54 @@ def step_truth(
 def step_deviations(
     figures: tuple[Weighed, ...], found: Loop, made: Campaign, *, alone: bool = False
 ) -> dict[str, float]:
-    """Places of the figures of the device without its effects."""
+    """Places of the figures of the device."""
     axes = made.device.response_axes, made.device.drive_axes
-    span = found.problem.scales.span
-    told = [[as_told(path, found, made) for path in row] for row in made.device.paths]
-    truth = {
-        f"{key}[{response.name}_{drive.name}]": value
-        for response, row in zip(axes[0], told, strict=True)
-        for drive, path in zip(axes[1], row, strict=True)
-        for key, value in step_truth(partial(risen, path), path.steady, path.delay, span).items()
-    }
+    span, steady = found.problem.scales.span, steady_truth(found, made)
+    hidden, told = unnamed(found, made), told_device(found, made)
+    truth = {}
+    for j, drive in enumerate(axes[1]):
+        time = np.linspace(0.0, span, _FINE)
+        seen = unit_responses(told, hidden, j, time) if hidden else None
+        for i, response in enumerate(axes[0]):
+            path = told.paths[i][j]
+            rises = partial(risen, path)
+            if seen is not None:
+                rises = partial(_between, time - path.delay, seen[:, i] / steady[i, j])
+            own = step_truth(rises, steady[i, j], path.delay, span)
+            truth |= {f"{key}[{response.name}_{drive.name}]": value for key, value in own.items()}
     return places(figures, truth, alone=alone)
 
 
 def risen(path: TransferPath, time: Vector) -> Vector:
     """Response to a unit step, without the delay and over the steady one."""
     return np.asarray(path.stiffness * unit_step(path, time))
+
+
+def _between(nodes: Vector, values: Vector, time: Vector) -> Vector:
+    return np.asarray(np.interp(time, nodes, values))
+
+
+def unnamed(found: Loop, made: Campaign) -> tuple[Hidden, ...]:
+    """Hidden effects that are part of the response that was measured, since nothing tells them apart."""
+    return tuple(one for one in made.hidden if one.name in LINEAR and one.name not in found.names)
+
+
+def unit_responses(device: Device, hidden: tuple[Hidden, ...], drive: int, time: Vector) -> Matrix:
+    """Responses to a unit step of one drive at time 0, (times, axes) [response unit / drive unit]."""
+    shot = shot_of(device, 0.0, np.random.default_rng(0))
+    command = step(np.eye(len(device.paths[0]))[drive])
+    return HiddenDevice(device, hidden, shot).response(command, time) - np.array(device.offsets)
+
+
+def steady_truth(found: Loop, made: Campaign) -> Matrix:
+    """Gains of the device, (responses, drives), with what unnamed linear effects add in the end."""
+    steady = np.array([[path.steady for path in row] for row in made.device.paths])
+    hidden, late = unnamed(found, made), _LATE * found.problem.scales.span * np.array([1.0, 1.0 + 1e-6])
+    if hidden:
+        for j in range(steady.shape[1]):
+            own, bare = (unit_responses(made.device, acting, j, late)[-1] for acting in (hidden, ()))
+            steady[:, j] += own - bare
+    return steady
 
 
 def places(
@@ -165,6 +204,12 @@ def places(
 def side_figures(found: Loop, side: Side) -> tuple[Weighed, ...]:
     """Figures of one side alone."""
     return found.figures_of(side.state, *mixture(side.state, None, ()))
+
+
+def told_device(found: Loop, made: Campaign) -> Device:
+    """The device of such paths."""
+    paths = tuple(tuple(as_told(path, found, made) for path in row) for row in made.device.paths)
+    return replace(made.device, paths=paths)
 
 
 def as_told(path: TransferPath, found: Loop, made: Campaign) -> TransferPath:

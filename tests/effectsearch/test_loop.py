@@ -355,6 +355,14 @@ def test_the_verdict_follows_from_what_was_found(change, kind):
     assert decide(replace(FOUND, **change)).kind == kind
 
 
+def test_why_nothing_is_named_is_said():
+    """No effect holds against a refit, or none is ahead of what has no name."""
+    none = replace(FOUND, effects=(), generic_name="unmodelled_nonlinear")
+    low, level = (replace(none, generic=none.largest - by) for by in (3.1, 2.9))
+    assert "no effect of the library survives a full refit: no name" in decide(low).sentence
+    assert "unmodelled_nonlinear describes it as well as any effect" in decide(level).sentence
+
+
 def test_what_chance_may_explain_is_said_beside_clean():
     """And takes the firmness of the verdict."""
     sure = decide(replace(FOUND, alarmed=False))

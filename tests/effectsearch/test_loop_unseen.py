@@ -175,3 +175,11 @@ def test_a_measured_plant_that_is_missed_is_not_clean():
     assert "independent ones, too few beside 5 parameters" in found.verdict.sentence
     assert "the error of plate is 2.81 times the noise" in found.verdict.sentence
     assert found.before.unseen[0].rmse > 2 * found.before.fit[0].rmse
+
+
+@pytest.mark.skipif(not RECORDS.is_dir(), reason="measured records are absent; set LCOPA_BAYES_DATA")
+def test_an_effect_with_which_parts_left_out_are_predicted_worse_is_not_named():
+    """Its size is known from the part alone that shows it: 407 counts become 737."""
+    found = loop(load_study(RECORDS / "lcd_panel_r_from102_to204"), sample=False)
+    assert (found.verdict.kind, found.names) == ("unexplained", ())
+    assert "the error on unseen records is 1.81 times as large with it" in found.verdict.sentence

@@ -83,7 +83,7 @@ def test_the_advantage_is_akaikes_criterion_of_two_least_squares(short: Fit, ove
 def test_a_better_sum_of_lags_limits_every_number(short: Fit) -> None:
     fitted = with_alternatives(short)
     assert fitted.draws.grade.level == "tentative"
-    assert "a sum of 2 lags follows y better" in fitted.draws.grade.reason
+    assert "sums of 2 to 3 lags follow y better" in fitted.draws.grade.reason
     reported = {one.name: one for one in fitted.metrics}["delay[y]"]
     assert reported.lower <= DELAY <= reported.upper
     assert "of sums of lags" in reported.note
@@ -109,7 +109,8 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
         return
     assert one.support == "both"
     number = {number.estimate.name: number for number in other.numbers}["steady_state[y]"]
-    pooled = np.concatenate([number.plant, number.lags])
+    ours, theirs = number.plant, number.lags
+    pooled = np.concatenate([np.repeat(ours, theirs.size), np.repeat(theirs, ours.size)])
     assert number.estimate.lower == pytest.approx(float(np.quantile(pooled, 0.05)), rel=0.02)
     noise, structure = parts_of_sd([number.plant, number.lags], np.array([0.5, 0.5]))
     assert noise**2 + structure**2 == pytest.approx(float(np.var(pooled)), rel=1e-6)

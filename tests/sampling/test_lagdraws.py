@@ -7,14 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from inference.test_diffusion import DELAY as SLAB_DELAY
+from inference.test_diffusion import records_of
 from inference.test_lagsum import DELAY, GAINS, SD, lags, made
 from small import U, Y
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.diffusion import rises
 from lcopa_bayes.inference.lagsum import lag_problem
-from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, _begun, _walked, _weighted, lag_draws
+from lcopa_bayes.sampling.lagdraws import (
+    LagDraws,
+    LagMixture,
+    LagSearch,
+    _begun,
+    _walked,
+    _weighted,
+    lag_draws,
+    likely,
+)
 
 ENDS = np.array([[0.0, 1.0]])
 
@@ -24,7 +36,8 @@ def drawn(seed: int = 0) -> LagDraws:
 
 
 def searched(seed: int = 0, ends: Matrix = ENDS) -> LagSearch:
-    return LagSearch.over(lag_problem(made(seed)), 0, [0], np.array([SD]), ends)
+    (one,) = LagSearch.over(lag_problem(made(seed)), 0, [0], np.array([SD]), ends, ["lags"])
+    return one
 
 
 @pytest.mark.parametrize("sampled", [_weighted, _walked])
@@ -34,7 +47,7 @@ def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]
     table = search.table
     assert search.best.lags == 1
     rng = np.random.default_rng(1)
-    draws, ess = sampled(table, _begun(search, rng), rng)
+    draws, ess = sampled(search, _begun(search, rng), rng)
     assert ess >= 160
     low, high = table.ends(2)
     axes = [np.linspace(low[k], high[k], 41)[:-1] + (high[k] - low[k]) / 80 for k in range(3)]
@@ -95,6 +108,55 @@ def test_the_response_is_the_sum_of_its_lags() -> None:
     assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-9, abs=1e-9)
 
 
+def slab(seed: int) -> tuple[LagSearch, ...]:
+    return LagSearch.over(
+        lag_problem(records_of("wall", seed)), 0, [0], np.array([SD]), np.array([[0.0, 1.5]])
+    )
+
+
+def test_a_wall_is_drawn_where_it_follows_the_records_best() -> None:
+    """Its delay, which draws of lags alone do not hold."""
+    searches = slab(0)
+    chosen = likely(searches)
+    assert chosen[0].kind == "wall"
+    assert all(one.best.bic < chosen[0].best.bic + 10.0 for one in chosen)
+    assert {one.kind for one in chosen} < {one.kind for one in searches}
+    held = dict.fromkeys(("wall", "lags"), 0)
+    for seed in range(4):
+        for one in slab(seed):
+            if one.kind in held:
+                low, high = np.quantile(lag_draws(one, seed).delays[:, 0], (0.01, 0.99))
+                held[one.kind] += low <= SLAB_DELAY <= high
+    assert held["wall"] >= 3  # of 4 at 98 %: fewer once in 400 times
+    assert held["lags"] < 3
+
+
+def test_the_response_of_a_wall_is_that_of_its_series_and_lags() -> None:
+    one = lag_draws(slab(0)[1], 0)
+    assert one.kind == "wall"
+    time = np.array([0.1, 0.5, 1.0, 10.0, 1e4])
+    since = np.maximum(time - one.delays[3, 0], 0.0)
+    expected = one.weights[3, 0, 0] * rises("wall", since, one.times[3, 0, 0])
+    expected += lags(since, tuple(one.weights[3, 0, 1:]), tuple(one.times[3, 0, 1:]), 0.0)
+    assert one.response(0, time)[3] == pytest.approx(expected, abs=1e-12)
+    assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-6, abs=1e-6)
+
+
+def test_kinds_have_equal_parts_in_a_mixture() -> None:
+    searches = slab(0)[:2]
+    both = LagMixture.of(searches, 3)
+    apart = [lag_draws(one, 3, 100.0) for one in searches]
+    ends = [set(one.delays[:, 0]) for one in apart]
+    counts = [sum(value in own for value in both.delays[:, 0]) for own in ends]
+    assert counts[0] == counts[1] == len(both.delays) / 2
+    assert both.ess == pytest.approx(2 * min(one.ess for one in apart))
+    time = np.array([5.0])
+    source = apart[int(both.delays[0, 0] in ends[1])]
+    place = int(np.flatnonzero(source.delays[:, 0] == both.delays[0, 0])[0])
+    assert both.response(0, time)[0] == pytest.approx(source.response(0, time)[place])
+    assert both.gains[0] == pytest.approx(source.gains[place])
+
+
 def chains(seed: int) -> Study:
     """Two drives of one response, each with three lags one behind the other: short ones look like a delay."""
     rng = np.random.default_rng(seed)
@@ -114,8 +176,9 @@ def chains(seed: int) -> Study:
 def test_walkers_of_several_paths_leave_where_they_began() -> None:
     """Moves of all ten coordinates at once leave hardly more than one effective draw a walker, which is the
     one that it began with."""
-    search = LagSearch.over(lag_problem(chains(0)), 0, [0, 1], np.array([0.05]), np.array([[0.0, 0.2]] * 2))
+    ends = np.array([[0.0, 0.2]] * 2)
+    (search,) = LagSearch.over(lag_problem(chains(0)), 0, [0, 1], np.array([0.05]), ends, ["lags"])
     rng = np.random.default_rng(1)
-    draws, ess = _walked(search.table, _begun(search, rng), rng)
+    draws, ess = _walked(search, _begun(search, rng), rng)
     assert draws.shape[1] >= 8
     assert ess >= 200

@@ -16,8 +16,13 @@ import campaigns
 import devicetruth
 import scoresheet
 
-from lcopa_bayes.bench.hiddeneffects import Shot
-from lcopa_bayes.bench.undeclared import NAMED
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.hiddeneffects import Hidden, HiddenDevice, Shot
+from lcopa_bayes.bench.planteffects import beside
+from lcopa_bayes.bench.undeclared import NAMED, shot_of
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.path import TransferPath
 
@@ -98,6 +103,61 @@ def test_the_figures_of_a_lag_are_those_of_the_closed_form() -> None:
     assert reported["rise_10_90"] == pytest.approx(2.0 * np.log(9), rel=1e-6)
     assert reported["value_at_end"] == pytest.approx(0.3 * -np.expm1(-5.0), rel=1e-6)
     assert devicetruth.step_truth(*of, 6.0)["rise_10_90"] == np.inf
+
+
+def device() -> Device:
+    """Every path a lag of 2 ms behind a delay."""
+    gains = (0.6, 0.1), (0.2, 0.5)
+    paths = tuple(tuple(TransferPath(gain, 1.0, (2.0,), (1.0,), 1.0) for gain in row) for row in gains)
+    drives, responses = (tuple(Axis(name, unit) for name in "xy") for unit in ("V", "rad"))
+    return Device(paths, drives, responses, (0.3, -0.1))
+
+
+def truth_of(hidden: Hidden, *named: str) -> dict[str, float]:
+    """Figures that are scored, with places that are the truth itself."""
+    made = SimpleNamespace(device=device(), hidden=(hidden,))
+    scales = SimpleNamespace(span=30.0)
+    found = SimpleNamespace(names=named, problem=SimpleNamespace(scales=scales))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(devicetruth, "places", lambda figures, truth, alone: truth)
+        return devicetruth.step_deviations((), found, made) | {
+            "steady": devicetruth.steady_truth(found, made)
+        }
+
+
+def test_an_unnamed_linear_effect_is_part_of_the_device_that_was_measured() -> None:
+    lag = truth_of(Hidden("sensor_lag", {"Ts": 0.5}, lag=0.5))
+    times = np.array([2.0, 0.5])
+
+    def both_lags(time: Vector) -> Vector:
+        weights = times / (times - times[::-1])
+        return 1 - np.exp(-time[:, None] / times) @ weights
+
+    expected = devicetruth.step_truth(both_lags, 0.6, 1.0, 30.0)
+    assert lag["rise_10_90[x_x]"] == pytest.approx(expected["rise_10_90"], rel=1e-4)
+    assert lag["value_at_end[x_x]"] == pytest.approx(expected["value_at_end"], rel=1e-6)
+    assert lag["steady"] == pytest.approx(np.array([[0.6, 0.1], [0.2, 0.5]]), rel=1e-9)
+    k, time = 0.04, 20.0
+    creep = Hidden("ion_creep", {}, seen=beside(lambda t: k * (1 - np.exp(-t / time)), static=False))
+    alone, named = truth_of(creep), truth_of(creep, "ion_creep")
+    at_end = 0.6 * (1 - np.exp(-29.0 / 2.0) + k * (1 - np.exp(-29.0 / time)))
+    assert alone["value_at_end[x_x]"] == pytest.approx(at_end, rel=1e-6)
+    assert named["value_at_end[x_x]"] == pytest.approx(0.6 * (1 - np.exp(-29.0 / 2.0)), rel=1e-9)
+    assert alone["steady"] == pytest.approx(np.array([[0.6 * (1 + k), 0.1], [0.2, 0.5 * (1 + k)]]), rel=1e-6)
+    assert named["steady"] == pytest.approx(np.array([[0.6, 0.1], [0.2, 0.5]]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", devicetruth.LINEAR)
+def test_what_counts_as_linear_adds_up(name: str) -> None:
+    """The response to two steps of one drive is the sum of those to each."""
+    hidden, own = NAMED[name](np.random.default_rng(5)), device()
+    time = np.linspace(0.0, 30.0, 601)
+    later = np.concatenate([np.zeros((200, 2)), devicetruth.unit_responses(own, (hidden,), 0, time)[:-200]])
+    shot = shot_of(own, 0.4, np.random.default_rng(1))
+    both_steps = Command(np.array([0.0, 10.0]), np.array([[1.0, 0.0], [-1.5, 0.0]]), np.zeros(2))
+    answered = HiddenDevice(own, (hidden,), shot).response(both_steps, time) - np.array(own.offsets)
+    expected = devicetruth.unit_responses(own, (hidden,), 0, time) - 2.5 * later
+    assert np.abs(answered - expected).max() < 1e-9
 
 
 def test_the_place_of_a_truth_is_positive_where_values_lie_above_it() -> None:
