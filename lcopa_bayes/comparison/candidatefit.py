@@ -261,7 +261,8 @@ def card(
     weighed = None if candidate.improper else fitted.evidence
     parts = predictions(fitted) if usable else ()
     result = criteria(fitted, also)
-    lags = alternatives_of(fitted) if usable and not candidate.integer else ()
+    # a diffusion has memory as fractional orders have: it is no rival of integer order
+    lags = alternatives_of(fitted, ["lags"]) if usable and not candidate.integer else ()
     entries: dict[str, Any] = plain(
         {
             **attributes(candidate, "name", "about", "notes", "integer", "terms"),

@@ -93,7 +93,7 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
 def _lags(free: Row, lags: Sequence[Row]) -> str:
     """Which sums of lags follow the records, without how well."""
     parts = [
-        f"sums of {one['lags']} lags for {', '.join(one['paths'])} (AIC "
+        f"{one['said']} for {', '.join(one['paths'])} (AIC "
         f"{'lower' if one['aic_advantage'] > 0 else 'higher'} by {abs(one['aic_advantage']):.1f})"
         for one in lags
     ]

@@ -19,6 +19,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
 from lcopa_bayes.core.wording import listed
+from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import Metric, metrics_of
@@ -130,9 +131,9 @@ class Alternatives:
         )
 
 
-def alternatives_of(fitted: Fit) -> tuple[Alternative, ...]:
-    """Sums of lags beside a fit; none where its noise is not normal, its plant has effects, or `lags_beside`
-    has none."""
+def alternatives_of(fitted: Fit, kinds: Sequence[Kind] = KINDS) -> tuple[Alternative, ...]:
+    """Sums of lags of these kinds beside a fit; none where its noise is not normal, its plant has effects, or
+    `lags_beside` has none."""
     posterior, draws = fitted.problem.posterior, fitted.draws
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
         return ()
@@ -141,7 +142,7 @@ def alternatives_of(fitted: Fit) -> tuple[Alternative, ...]:
     axes = range(len(posterior.table.layout.responses))
     noise = tuple(posterior.noise_parameters(best, axis)[0] for axis in axes)
     seed = fitted.run.plan.seed
-    return lags_beside(FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed))
+    return lags_beside(FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed), kinds)
 
 
 def with_alternatives(fitted: Fit) -> Fit:

@@ -17,6 +17,7 @@ from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.inference.observations import Samples
@@ -91,6 +92,7 @@ class Alternative:
         return {
             "paths": [one.name for one in self.paths],
             "kind": self.search.kind,
+            "said": self.said,
             "lags": best.lags,
             "times": [sorted(row) for row in times.tolist()],
             "aic_advantage": self.advantage,
@@ -123,9 +125,9 @@ class FittedPlant:
         return self.problem.posterior
 
 
-def lags_beside(plant: FittedPlant) -> tuple[Alternative, ...]:
-    """Sums of lags beside a fitted plant, one for each response axis that has any; none where no drive moves
-    or the records do not determine them."""
+def lags_beside(plant: FittedPlant, kinds: Sequence[Kind] = KINDS) -> tuple[Alternative, ...]:
+    """Sums of lags of these kinds beside a fitted plant, one for each response axis that has any; none where
+    no drive moves or the records do not determine them."""
     try:
         own = plant.posterior
         followed = own if plant.samples is None else replace(own, samples=plant.samples)
@@ -133,7 +135,9 @@ def lags_beside(plant: FittedPlant) -> tuple[Alternative, ...]:
     except InputError:
         return ()
     open_paths = [_open(plant.posterior, axis) for axis in range(len(plant.noise))]
-    return tuple(_alternative(plant, problem, axis, paths) for axis, paths in enumerate(open_paths) if paths)
+    return tuple(
+        _alternative(plant, problem, axis, paths, kinds) for axis, paths in enumerate(open_paths) if paths
+    )
 
 
 def sentence_of(found: Sequence[Alternative]) -> str:
@@ -213,7 +217,9 @@ def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
     return tuple(out)
 
 
-def _alternative(plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
+def _alternative(
+    plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...], kinds: Sequence[Kind]
+) -> Alternative:
     posterior, noise = thinned(plant.posterior), plant.noise[axis]
     assert isinstance(posterior.noise, GaussianNoise)
     units, square = posterior.responses(plant.values[None]), 0.0
@@ -223,7 +229,7 @@ def _alternative(plant: FittedPlant, problem: Problem, axis: int, paths: tuple[P
         square += float((posterior.noise.standard(residual, noise[None], observed.gaps) ** 2).sum())
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 10 * _STREAM + axis
-    searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends))
+    searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends, kinds))
     parameters = _parameters(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
     best = searches[0].best
     advantage = square + 2 * parameters - best.square - 2 * best.parameters

@@ -267,7 +267,7 @@ def plants(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return out
 
 
-LINEAR = "Unmodelled linear dynamics are missing: sums of"
+LINEAR = "Unmodelled linear dynamics are missing: "
 """How a loop says that sums of lags are all that the records ask for."""
 
 

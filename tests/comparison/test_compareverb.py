@@ -52,7 +52,7 @@ def reported(folder) -> dict:
 def test_the_generating_model_is_preferred_and_the_reason_reported(reported):
     assert reported["preferred"] == "fractional-1"
     assert reported["fractional"]["verdict"] == "not shown"  # 40 samples do not tell it from two lags
-    assert "sums of 2 lags for y" in reported["fractional"]["sentence"]
+    assert "sums of 2 to 3 lags for y" in reported["fractional"]["sentence"]
     assert reported["fractional"]["log_bayes_factor"] > 10
     assert reported["agreement"]["agree"]
     first, whole = reported["models"]
@@ -249,4 +249,4 @@ def test_one_fractional_term_beats_second_order_on_the_heating_system(tmp_path):
     assert free < 5.0 < whole
     assert reported["fractional"]["log_bayes_factor"] > 20
     assert reported["fractional"]["verdict"] == "not warranted"  # three lags do better than either
-    assert "Beside fractional-1, sums of 3 lags for plate" in reported["fractional"]["sentence"]
+    assert "Beside fractional-1, sums of 3 to 4 lags for plate" in reported["fractional"]["sentence"]

@@ -370,7 +370,12 @@ def test_a_fractional_win_needs_evidence_and_prediction():
 
 def test_a_win_needs_sums_of_lags_to_lose_too():
     def held(support: str, advantage: float) -> dict:
-        lags = {"lags": 2, "paths": ["p"], "support": support, "aic_advantage": advantage}
+        lags = {
+            "said": "sums of 2 lags",
+            "paths": ["p"],
+            "support": support,
+            "aic_advantage": advantage,
+        }
         free = card("free", 20.0, 10.0, parameters=6, sums_of_lags=[lags])
         return dict(outcome(free, card("first-order", 0.0, 0.0))["fractional"])
 

@@ -58,7 +58,7 @@ def chain() -> Loop:
 def test_a_chain_of_lags_takes_no_name(chain: Loop):
     assert chain.verdict.kind == "unexplained"
     assert chain.names == ()
-    assert chain.verdict.sentence.startswith("Unmodelled linear dynamics are missing: sums of 3 lags")
+    assert chain.verdict.sentence.startswith("Unmodelled linear dynamics are missing: sums of 3 to 4 lags")
     assert [one.support for one in chain.lags] == ["lags"]
     shown = results(chain)
     assert "Sums of 3 to 4 lags follow the records better" in shown["alternatives"]["sentence"]

@@ -132,7 +132,7 @@ def rows() -> list[dict]:
     common |= {"disturbance": False, "survival": {}, "refits": [], "coverage_after": 0.9, "plant": "wall"}
     common |= {key: {"held_out_truth_over_noise": 0.5} for key in ("before", "after")}
     figures = {"steady_state[y1]": 1.0, "delay[y1]": -2.0, "value_at_end[y1]": 0.1, "rise_10_90[y1]": 1.6}
-    lags = f"{scoresheet.LINEAR} 3 lags follow y1 as well as any effect."
+    lags = f"{scoresheet.LINEAR}sums of 3 lags follow y1 as well as any effect."
     said = [
         ("clean", [], ""),
         ("explained", ["cross_fade"], ""),
