@@ -30,6 +30,9 @@ _DAMPING = (1e-2, 1e-9, 1e6)
 _GAIN, _FREE = 0.02, 1.0
 """Gain that a step promises below which there is no further one [nat], and largest damping at which that
 shows an optimum [-]."""
+_FASTER, _HOPELESS = 10.0, 50.0
+"""How many times faster than a step promises a descent may go on, and how far below the best of its batch it
+then stays where it cannot matter [-, nat]."""
 _QUARTERS = (0.1587, 0.8413)
 """Quantiles of a prior one standard deviation apart from the middle, were it normal."""
 
@@ -254,16 +257,18 @@ class Conditional:
 
     def descended(self, values: Matrix, steps: int) -> tuple[Expanded, Vector]:
         """Expansions about the optima near table values, after Levenberg and Marquardt's steps, so many at
-        most and until one gains nothing; and what they maximise: log likelihood and normal priors as wide as
-        the priors, (batch,) [nat]."""
+        most and until one gains nothing, or those that remain too little to come near the best of the batch;
+        and what they maximise: log likelihood and normal priors as wide as the priors, (batch,) [nat]."""
         at = self.expanded(values)
         level, gradient, information = self._objective(at)
         damping, moving = np.full(len(values), _DAMPING[0]), np.arange(len(values))
-        for _ in range(steps):
+        for remaining in range(steps, 0, -1):
             here, slope = Expanded(*(part[moving] for part in at)), gradient[moving]
             x = self._stepped(here, slope, information[moving], damping[moving])
-            arrived = (np.abs(slope * (x - here.x)).sum(axis=1) < _GAIN) & (damping[moving] <= _FREE)
-            moving, x, before = moving[~arrived], x[~arrived], here.values[~arrived]
+            gain = np.abs(slope * (x - here.x)).sum(axis=1)
+            hopeless = level[moving] + _FASTER * remaining * gain + _HOPELESS < level.max()
+            ends = ((gain < _GAIN) | hopeless) & (damping[moving] <= _FREE)
+            moving, x, before = moving[~ends], x[~ends], here.values[~ends]
             if not moving.size:
                 break
             proposed, exists = self.values(x, before)

@@ -156,6 +156,11 @@ class Circle:
         return np.asarray(1.0 - np.exp(np.log(_WRAP) / self.length - 1j * angle))
 
     @cached_property
+    def running(self) -> Spectrum:
+        """``1 / (1 - z)`` on the circle: sums up the coefficients of a series."""
+        return np.asarray(1.0 / self.difference)
+
+    @cached_property
     def bend(self) -> Spectrum:
         """``(1 - z)^3 (2 - z)`` on the circle: ``1 - z`` times the square of a derivative, exact to the third
         order, of blocks in the past alone."""
@@ -166,6 +171,11 @@ class Circle:
         """``1 + (1 - z)^2 (2 - z) / 12`` on the circle, no zero inside: the factor by which integrals of
         block pulses are too large, whatever their order; more depends on the order (`stepresponse`)."""
         return np.asarray(1.0 + self.difference**2 * (1.0 + self.difference) / 12.0)
+
+    @cached_property
+    def smoothed(self) -> Spectrum:
+        """`difference` times `smoothing`."""
+        return np.asarray(self.difference * self.smoothing)
 
     def spectrum(self, coefficients: Array) -> Spectrum:
         """Values on the circle of the series with these coefficients, (..., n)."""

@@ -23,21 +23,11 @@ from functools import cached_property
 from typing import Literal, final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import zeta
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, integration_weights_slope
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class TransferSlopes:
-    """Derivatives of a transfer function on the circle, one entry per viscous term."""
-
-    log_times: tuple[Spectrum, ...]
-    """In the logarithm of each time constant."""
-    orders: tuple[Spectrum, ...]
-    """In each order, where wanted."""
 
 
 def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
@@ -69,8 +59,9 @@ def transfer(
     whose time constants are all below about 0.3 step (corrected and undamped, of order 2, below 3 steps) when
     its top order exceeds 1: the block-pulse scheme is then unstable and needs shorter blocks.
     """
-    top, denominator, _ = _parts(times, orders, circle, step, corrected)
-    return top / denominator
+    top, denominator, *_ = _parts(times, orders, circle, step, corrected)
+    inverse = np.divide(1.0, denominator, out=denominator)
+    return np.multiply(top, inverse, out=inverse)  # to the last bit as in `transfer_slopes`
 
 
 def transfer_slopes(
@@ -81,55 +72,69 @@ def transfer_slopes(
     *,
     in_orders: bool = True,
     corrected: bool = False,
-) -> tuple[Spectrum, TransferSlopes]:
+) -> Spectrum:
     """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
-    order."""
-    top, denominator, integrals = _parts(times, orders, circle, step, corrected)
-    value = top / denominator
-    scale = _scale(times, orders, step)
-
-    by_time = tuple(
-        -value * (orders[:, i, None] * scale[i]) * integral / denominator
-        for i, integral in enumerate(integrals)
-    )
+    order: rows of one array, (1 + terms or 1 + 2 terms, ..., batch, length // 2 + 1)."""
+    top, denominator, integrals, scale = _parts(times, orders, circle, step, corrected)
+    terms = orders.shape[1]
+    out = np.empty((1 + terms * (1 + in_orders), *denominator.shape), dtype=np.complex128)
+    inverse = np.divide(1.0, denominator, out=denominator)
+    value = np.multiply(top, inverse, out=out[0])
+    falling = -value
+    falling *= inverse  # the derivative of the quotient in its denominator
+    by_time, by_order = out[1 : 1 + terms], out[1 + terms :]
+    for i, integral in enumerate(integrals):
+        part = np.multiply(falling, integral, out=by_time[i])
+        part *= scale[i]
+        if in_orders:
+            np.multiply(part, np.log(times[..., i, None] / step), out=by_order[i])
+        part *= orders[:, i, None]
     if not in_orders:
-        return value, TransferSlopes(by_time, ())
-    logs = np.log(times / step)
-    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
-    by_order = []
-    integrated = np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
+        return out
+    integrated = _integrated(orders)
     weights = integration_weights_slope(integrated.ravel(), circle.n, 1.0)
     slopes = _differenced(weights, circle).reshape(*orders.shape, -1)
     driven = slopes[:, 0]
     if corrected:
         driven = driven * circle.smoothing
-        slopes = slopes - _leftover(integrated, slope=True)[..., None] * circle.bend
-    leading = driven - value * (slopes[:, 0] + scale[0] * log_times[0] * integrals[0])
-    for i in range(1, orders.shape[1]):
-        bent = slopes[:, i]
-        leading = leading - value * scale[i] * bent
-        by_order.append(-value * scale[i] * (log_times[i] * integrals[i] - bent) / denominator)
-    return value, TransferSlopes(by_time, (leading / denominator, *by_order))
+        slopes -= _leftover(integrated, slope=True)[..., None] * circle.bend
+    leading = np.broadcast_to(slopes[:, 0], value.shape).copy()
+    for i in range(1, terms):
+        bent = scale[i] * slopes[:, i]
+        leading += bent
+        bent *= falling
+        by_order[i] -= bent
+    by_order[0] += np.multiply(leading, falling, out=leading)
+    by_order[0] += np.multiply(driven, inverse, out=inverse)
+    return out
 
 
 def _parts(
     times: Array, orders: Matrix, circle: Circle, step: float, corrected: bool
-) -> tuple[Spectrum, Spectrum, list[Spectrum]]:
+) -> tuple[Spectrum, Spectrum, list[Spectrum], list[Array]]:
     """P^a1, the denominator, and P^(a1 - ai) of every term, all times ``1 - z``, in blocks of width 1;
-    `corrected` all are multiplied by `Circle.smoothing` too."""
-    scale = _scale(times, orders, step)
-    integrated = np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
+    `corrected` all are multiplied by `Circle.smoothing` too. Last ``(T / step)^order`` of every term, each
+    (..., batch, 1) [-]."""
+    powers = (times / step) ** orders
+    scale = [powers[..., i, None] for i in range(orders.shape[1])]
+    integrated = _integrated(orders)
     weights = integration_weights(integrated.ravel(), circle.n, 1.0)
     spectra = _differenced(weights, circle).reshape(*orders.shape, -1)
-    top, same = spectra[:, 0], circle.difference[None]
+    top, same = spectra[:, 0], circle.difference
     if corrected:
-        top, same = top * circle.smoothing, same * circle.smoothing
+        top, same = top * circle.smoothing, circle.smoothed
         spectra -= _leftover(integrated)[..., None] * circle.bend
     integrals = [same, *(spectra[:, i] for i in range(1, orders.shape[1]))]
-    denominator = spectra[:, 0] + scale[0] * integrals[0]
-    for i in range(1, orders.shape[1]):
-        denominator += scale[i] * integrals[i]
-    return top, denominator, integrals
+    denominator = np.asarray(scale[0] * same)
+    denominator += spectra[:, 0]
+    for factor, integral in zip(scale[1:], integrals[1:], strict=True):
+        denominator += factor * integral
+    return top, denominator, integrals, scale
+
+
+def _integrated(orders: Matrix) -> Matrix:
+    """How many times the drive and each term but the first are integrated, (batch, terms) [-]."""
+    return np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
 
 
 def _leftover(orders: Matrix, *, slope: bool = False) -> Matrix:
@@ -143,12 +148,6 @@ def _leftover(orders: Matrix, *, slope: bool = False) -> Matrix:
         return (_leftover(orders + _NUDGE) - _leftover(orders - _NUDGE)) / (2 * _NUDGE)
     powers = (2 * np.pi) ** (-orders - 2)
     return np.asarray(-2 * powers * np.cos(np.pi * orders / 2) * zeta(orders + 2))
-
-
-def _scale(times: Array, orders: Matrix, step: float) -> list[Array]:
-    """``(T / step)^order`` of every term, each (..., batch, 1) [-]."""
-    powers = (times / step) ** orders
-    return [powers[..., i, None] for i in range(orders.shape[1])]
 
 
 def _differenced(weights: Matrix, circle: Circle) -> Spectrum:
@@ -245,12 +244,11 @@ class StepResponse:
         Parameters: theta (places, batch) in [0, 1) [blocks], one column for each element.
         """
         n = self.coarse.shape[2] - _SIDE
-        weights = taps(theta, kind)[..., None]
         out = np.zeros((self.coarse.shape[0], *theta.shape, n))
         inner = out[..., _SIDE:]
-        coarse = self.coarse[:, None]
-        for weight, shift in zip(weights, range(2 * _SIDE + 1), strict=True):
-            inner += weight * coarse[..., shift : shift + n - _SIDE]
+        around = sliding_window_view(self.coarse[:, None], 2 * _SIDE + 1, axis=3)
+        weights = np.moveaxis(taps(theta, kind), 0, -1)[..., None]
+        np.matmul(around, weights, out=inner[..., None])
         if kind == "integral":
             inner += self._sums[:, None, :, _SIDE:n]
         first = min(_NEAR, n)
@@ -313,10 +311,10 @@ class StepResponse:
         power = position < _POWER
         place = np.where(power, _POWER, position)
         block = np.minimum(np.floor(place).astype(int), _FINE - _SIDE - 1)
-        weights = taps(place - block, kind)
-        values = np.zeros((self.fine.shape[0], x.size))
-        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
-            values += weight * self.fine[:, level, element, block + shift]
+        around = sliding_window_view(self.fine, 2 * _SIDE + 1, axis=3)[:, level, element, block - _SIDE]
+        values = np.asarray(
+            np.matmul(around[:, :, None], taps(place - block, kind).T[:, :, None])[:, :, 0, 0]
+        )
         if kind == "integral":
             values = (values + self._fine_sums[:, level, element, block]) * width
         elif kind == "slope":
@@ -390,11 +388,8 @@ def _hand_over(narrow: Array, wide: Array) -> None:
 def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: Slopes) -> Array:
     """Block means of the step responses, (rows, ..., n); times in blocks."""
     if slopes is None:
-        return _stepped(transfer(times, orders, circle, 1.0, corrected=True), circle)[None]
-    value, parts = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all", corrected=True)
-    return np.stack([_stepped(row, circle) for row in (value, *parts.log_times, *parts.orders)])
-
-
-def _stepped(spectrum: Spectrum, circle: Circle) -> Array:
-    """Response to a unit step from the first block on."""
-    return circle.coefficients(spectrum / circle.difference)
+        spectra = transfer(times, orders, circle, 1.0, corrected=True)[None]
+    else:
+        spectra = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all", corrected=True)
+    spectra *= circle.running  # a unit step from the first block on
+    return circle.coefficients(spectra)

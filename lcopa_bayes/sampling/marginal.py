@@ -95,8 +95,9 @@ _POPULATION = 50.0
 _SPARE, _LEAST_RATE = 1.15, 0.2
 """Factor on the estimated number of draws needed, and least of them that are taken to count for the parameter
 that is known least, over the effective share of all [-]."""
-_TASK = 64
-"""Points of a task."""
+_TASK, _SAMPLES = (64, 192), 48_000
+"""Points of a task, least and most, and samples of all their responses: calls take most of the time of a few
+points of a short record. A round is four tasks or more, for as many processes [-]."""
 
 
 @final
@@ -388,7 +389,7 @@ class Search:
 
     def _done(self, task: Optima | Draw, values: Matrix, starts: Matrix | None) -> list[Matrix]:
         """A task for all points, by the workers."""
-        count = max(1, ceil(len(values) / _TASK))
+        count = max(1, ceil(len(values) / int(np.clip(_SAMPLES // self.posterior.size, *_TASK))))
         begins: Sequence[Matrix | None] = [None] * count if starts is None else np.array_split(starts, count)
         tasks = zip(np.array_split(values, count), begins, self._seeds.spawn(count), strict=True)
         parts = []

@@ -100,6 +100,24 @@ def test_a_descent_from_prior_draws_reaches_one_optimum():
             assert abs(exact - predicted) < 0.05
 
 
+def test_a_descent_that_cannot_come_near_the_best_of_its_batch_ends(monkeypatch):
+    """The others are what they are alone, and that one stays as far below."""
+    posterior, counts, expand = problem(record(camera=0.2)).posterior, [], Conditional.expanded
+    monkeypatch.setattr(Conditional, "expanded", lambda of, at: counts.append(len(at)) or expand(of, at))
+    conditional = Conditional(posterior, delays=True)
+    values = drawn(posterior, 40)
+    values[:, posterior.table.at("order", 0)] = np.linspace(0.3, 1.7, 40)
+    values[:, posterior.table.at("sigma", 0)] = TRUTH["sigma"]
+    _, together = conditional.descended(values.copy(), 12)
+    used = sum(counts)
+    alone = np.array([conditional.descended(one[None], 12)[1][0] for one in values])
+    near = alone > alone.max() - 50.0
+    assert 3 < near.sum() < 30
+    assert_allclose(together[near], alone[near], rtol=1e-9)
+    assert (together[~near] < together.max() - 50.0).all()
+    assert used < 0.8 * (sum(counts) - used)
+
+
 def test_times_whose_response_overflows_do_not_exist():
     posterior = problem(record(camera=0.6)).posterior
     conditional = Conditional(posterior, delays=True)

@@ -111,8 +111,7 @@ def test_circle_gives_back_what_it_took(n):
 
 def read(element: tuple[np.ndarray, np.ndarray], drive: np.ndarray, step: float) -> list[np.ndarray]:
     circle = Circle(drive.size)
-    value, slopes = transfer_slopes(element[0][None], element[1][None], circle, step)
-    parts = (value, *slopes.log_times, *slopes.orders)
+    parts = transfer_slopes(element[0][None], element[1][None], circle, step)
     return [circle.coefficients(part * circle.spectrum(drive[None]))[0] for part in parts]
 
 
