@@ -119,8 +119,8 @@ def explained_draws(
     result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
     if result is None:
         return None
-    draws = result[1]
-    width = discretisation(problem, draws, jobs=jobs)
+    run, draws = result
+    width = discretisation(problem, draws, surrogate=run.surrogate, jobs=jobs)
     return draws.limited(width.limitations), noise
 
 
