@@ -44,6 +44,8 @@ class LeastSquares:
     """Whether slopes of the plant are those with the effects in place."""
     held: tuple[Vector, ...] = ()
     """Parameters of `WhiteAR1` of each response axis, (3,), in place of the posterior's noise; or none."""
+    slopes: Posterior | None = None
+    """With effects what slopes are taken from, such as the same on wider blocks; None: the posterior."""
 
     @cached_property
     def columns(self) -> list[int]:
@@ -211,8 +213,12 @@ class LeastSquares:
         """The same with effects."""
         posterior, table = self.posterior, self.posterior.table
         assert posterior.simulation is not None
-        model = self._effected_at(values[0])
-        slopes = effect_slopes(posterior.simulation, values[0], exact=self.exact, model=model)
+        simulation, model = posterior.simulation, None
+        if self.slopes is None:
+            model = self._effected_at(values[0])
+        elif self.slopes.simulation is not None:
+            simulation = self.slopes.simulation
+        slopes = effect_slopes(simulation, values[0], exact=self.exact, model=model)
         times = table.of_kind("time")
         for each in slopes:
             each[..., times] *= values[0, times]

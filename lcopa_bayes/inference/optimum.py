@@ -134,13 +134,17 @@ def _recombined(posterior: Posterior, found: tuple[Optimum, ...]) -> tuple[Optim
 
 
 def again(
-    posterior: Posterior, optima: Sequence[Optimum], crew: Workers[Posterior] | None = None
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+    crew: Workers[Posterior] | None = None,
+    *,
+    slopes: Posterior | None = None,
 ) -> tuple[Optimum, ...]:
     """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
-    without those of no weight."""
+    without those of no weight. `slopes` as `LeastSquares`."""
     best = max(one.log_density for one in optima)
     near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
-    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew))
+    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew, slopes=slopes))
 
 
 def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
@@ -217,6 +221,20 @@ def _with_spare_terms(posterior: Posterior, found: Sequence[Optimum]) -> list[Ve
     return out
 
 
+def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
+    """The optimum that table values, (rows,), are known to be, with noise fitted to its residual; None where
+    they have no density."""
+    problem = LeastSquares(posterior)
+    values = posterior.complete(posterior.coordinates(values[None]), None)[0]
+    try:
+        values = problem.with_noise(values)
+        _, jacobian = problem.residual(problem.coordinates(values), values)
+    except UnstableError:
+        return None
+    there = _describe(posterior, problem, values, jacobian)
+    return there if np.isfinite(there.log_density) else None
+
+
 def optima_near(posterior: Posterior, starts: Sequence[Vector]) -> tuple[Optimum, ...]:
     """Optima of a posterior with effects that table values `starts`, (rows,) each, lead to, best first,
     duplicates removed."""
@@ -246,10 +264,11 @@ def _descended(
     *,
     rounds: int = 2,
     crew: Workers[Posterior] | None = None,
+    slopes: Posterior | None = None,
 ) -> list[Optimum]:
     """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
     response gives none."""
-    descend, problem = partial(_descent, rounds), LeastSquares(posterior)
+    descend, problem = partial(_descent, rounds, slopes), LeastSquares(posterior, slopes=slopes)
     ends = map(partial(descend, posterior), starts) if crew is None else crew.each(descend, starts)
     reached = sorted((end for end in ends if end is not None), key=lambda end: -end[0])
     optima = list[Optimum]()
@@ -264,10 +283,12 @@ def _descended(
     return optima
 
 
-def _descent(rounds: int, posterior: Posterior, values: Vector) -> tuple[float, Vector] | None:
+def _descent(
+    rounds: int, slopes: Posterior | None, posterior: Posterior, values: Vector
+) -> tuple[float, Vector] | None:
     """Log density [nat] and table values where a descent from others ends; None where there is no bounded
     response."""
-    problem = LeastSquares(posterior)
+    problem = LeastSquares(posterior, slopes=slopes)
     values = posterior.complete(posterior.coordinates(values[None]), None)[0]
     try:
         for evaluations, enough in _DESCENT[-rounds:]:

@@ -169,7 +169,8 @@ def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Proble
     if narrow is problem:
         return problem, tuple(optima)
     with threadpool_limits(1):
-        found = again(narrow.posterior, optima)
+        # slopes on wider blocks hardly differ and cost as many times less
+        found = again(narrow.posterior, optima, slopes=problem.posterior)
     return (narrow, found) if problem.ranges is None or not found else resolved_optima(narrow, found)
 
 
