@@ -44,8 +44,9 @@ class LeastSquares:
     """Whether slopes of the plant are those with the effects in place."""
     held: tuple[Vector, ...] = ()
     """Parameters of `WhiteAR1` of each response axis, (3,), in place of the posterior's noise; or none."""
-    slopes: Posterior | None = None
-    """With effects what slopes are taken from, such as the same on wider blocks; None: the posterior."""
+    begun: bool = False
+    """Whether a descent with effects keeps the slopes that it begins with: near an optimum they hardly
+    change, and cost several times what a response does."""
 
     @cached_property
     def columns(self) -> list[int]:
@@ -213,12 +214,8 @@ class LeastSquares:
         """The same with effects."""
         posterior, table = self.posterior, self.posterior.table
         assert posterior.simulation is not None
-        simulation, model = posterior.simulation, None
-        if self.slopes is None:
-            model = self._effected_at(values[0])
-        elif self.slopes.simulation is not None:
-            simulation = self.slopes.simulation
-        slopes = effect_slopes(simulation, values[0], exact=self.exact, model=model)
+        model = self._effected_at(values[0])
+        slopes = effect_slopes(posterior.simulation, values[0], exact=self.exact, model=model)
         times = table.of_kind("time")
         for each in slopes:
             each[..., times] *= values[0, times]
@@ -297,6 +294,9 @@ class LeastSquares:
         """
         if self.posterior.simulation is None:
             return apart(lambda x: self.residual(x, values), start)
+        if self.begun:
+            slopes = self.residual(start, values)[1]
+            return lambda x: self.misfit(x, values), start, lambda x: slopes
         return lambda x: self.misfit(x, values), start, lambda x: self.residual(x, values)[1]
 
     def noise_fits(self, values: Vector) -> list[NoiseFit]:

@@ -169,8 +169,7 @@ def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Proble
     if narrow is problem:
         return problem, tuple(optima)
     with threadpool_limits(1):
-        # slopes on wider blocks hardly differ and cost as many times less
-        found = again(narrow.posterior, optima, slopes=problem.posterior)
+        found = again(narrow.posterior, optima, begun=True)
     return (narrow, found) if problem.ranges is None or not found else resolved_optima(narrow, found)
 
 
