@@ -56,12 +56,11 @@ _FIRST, _CLEAR = 32, 0.05
 sd]."""
 _STAGES = (16, 32, 64, _FEWER)
 """Draws after which a measurement with a control variate may end."""
-_FEW_AT_ONCE = 8
-"""Draws that one process takes at once then [-]."""
-_CONTROLS = 1_000
+_CONTROLS = 500
 """Draws at which the control variate is evaluated."""
-_PRECISE = LARGEST / 4
-"""Error with which such a measurement ends whatever the shift [posterior sd]: it excuses up to twice that."""
+_PRECISE = 0.3 * LARGEST
+"""Error, root mean square over parameters, with which such a measurement ends whatever the shifts [posterior
+sd]: that of weighted draws is as large after eight times as many."""
 
 Responses: TypeAlias = Callable[[Matrix], Sequence[Simulated]]
 """Every record at canonical table values, (batch, rows)."""
@@ -276,7 +275,7 @@ def _controlled(
     narrow, wide, change = list[Sequence[Simulated]](), list[Sequence[Simulated]](), np.empty(0)
     for end in (*(stage for stage in _STAGES if stage < len(values)), len(values)):
         portion = values[len(change) : end]
-        parts = np.array_split(portion, max(1, len(portion) // _FEW_AT_ONCE))
+        parts = np.array_split(portion, max(2, len(portion) // _PORTION))  # for two processes at least
         there, here = (list(crew.map(each, parts)) for each in (finer.simulation, used.simulation))
         narrow, wide = [*narrow, *there], [*wide, *here]
         for part, after, before in zip(parts, there, here, strict=True):
@@ -289,7 +288,7 @@ def _controlled(
         unlike = _shifts(columns, change, alike)
         shifts, errors = at_many[0] + unlike[0], np.hypot(at_many[1], unlike[1])
         apart = np.abs(np.abs(shifts) - np.array([[LARGEST], [UNUSABLE]])).min(axis=0)
-        if ((apart > 2 * errors) | (errors < _PRECISE)).all():
+        if (apart > 2 * errors).all() or np.sqrt(np.mean(errors**2)) < _PRECISE:
             break
     return shifts, errors
 
