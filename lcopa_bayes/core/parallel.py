@@ -85,6 +85,22 @@ class _Later:
         self.result = partial(task, shared, one)
 
 
+@final
+class _Tasks:
+    """Tasks as they are sent to workers: pickled once for all inputs, with what they have cached."""
+
+    def __init__(self) -> None:
+        self._task: object = None
+        self._sent: tuple[int, bytes | None] = (0, None)
+
+    def sent(self, task: object) -> tuple[int, bytes | None]:
+        """The number of a task, by which a worker knows the one it did last, and its pickle; None where
+        another process could not read it."""
+        if task is not self._task:
+            self._task, self._sent = task, (self._sent[0] + 1, packed(task))
+        return self._sent
+
+
 @contextmanager
 def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Workers[S]]:
     """Workers that share a value: `jobs` processes of one thread each, this one alone where `jobs` is 1, or
@@ -102,12 +118,15 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
         with threadpool_limits(1):
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
-        sent = packed(shared)
+        sent, tasks = packed(shared), _Tasks()
         with _pool(jobs, sent) as pool, threadpool_limits(1):  # threads here would take the workers' cores
 
             def submit(task: Callable[[S, T], R], one: T) -> Any:
-                work = None if sent is None else packed((task, one))
-                return _Later(task, shared, one) if work is None else pool.submit(_perform, work)
+                number, work = tasks.sent(task)
+                given = None if sent is None or work is None else packed(one)
+                if work is None or given is None:
+                    return _Later(task, shared, one)
+                return pool.submit(_perform, number, work, given)
 
             yield Workers(submit, _as_finished)
 
@@ -119,13 +138,13 @@ def meanwhile(
     """Do a task in a process of its own while what is within runs, or before it where `jobs` is 1 or no other
     process can read the task; `finished` takes its result at once. An error of the task is raised at the
     end."""
-    work = None if jobs <= 1 else packed((partial(_alone, task), one))
-    if work is None:
+    work, given = (None, None) if jobs <= 1 else (packed(partial(_alone, task)), packed(one))
+    if work is None or given is None:
         finished(task(one))
         yield
         return
     with _pool(1, None) as pool:
-        future = pool.submit(_perform, work)
+        future = pool.submit(_perform, 1, work, given)
         future.add_done_callback(lambda done: None if done.exception() else finished(done.result()))
         yield
         future.result()
@@ -373,6 +392,12 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _perform(work: bytes) -> Any:
-    task, one = unpacked(work)
-    return task(_shared, one)
+_latest: tuple[int, Any] = (0, None)
+"""Number of the task that this worker process did last, and the task."""
+
+
+def _perform(number: int, work: bytes, given: bytes) -> Any:
+    global _latest
+    if _latest[0] != number:
+        _latest = number, unpacked(work)
+    return _latest[1](_shared, unpacked(given))

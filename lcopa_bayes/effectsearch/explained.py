@@ -16,7 +16,7 @@ from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.inference.noise import Noise
-from lcopa_bayes.inference.optimum import Optimum, nearly_white, optima_near
+from lcopa_bayes.inference.optimum import Optimum, again, known_optimum, nearly_white
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect, Ranges
@@ -108,9 +108,15 @@ def explained_draws(
     Where normal draws about its optimum are not `usable` these are returned: the posterior is around there,
     and takes some ten thousand simulations.
     """
-    problem = problem_of(study)
-    begun = optima_near(problem.posterior, [_values(problem.posterior, near)] if near else [])
-    problem, optima = resolved_optima(problem, begun) if begun else weighted_start(problem, quick=quick)
+    problem, optima = problem_of(study), tuple[Optimum, ...]()
+    known = known_optimum(problem.posterior, _values(problem.posterior, near)) if near else None
+    if known is not None:
+        narrow, optima = resolved_optima(problem, [known])
+        if narrow is problem:  # else it was descended to there
+            optima = again(problem.posterior, optima)
+        problem = narrow
+    if not optima:
+        problem, optima = weighted_start(problem_of(study), quick=quick)
     noise = problem.posterior.noise
     about = normal_draws(problem.posterior, optima[0], study.seed) if optima else None
     if about is not None and not usable(about, noise):
@@ -119,8 +125,8 @@ def explained_draws(
     result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
     if result is None:
         return None
-    draws = result[1]
-    width = discretisation(problem, draws, jobs=jobs)
+    run, draws = result
+    width = discretisation(problem, draws, surrogate=run.surrogate, jobs=jobs)
     return draws.limited(width.limitations), noise
 
 

@@ -44,6 +44,9 @@ class LeastSquares:
     """Whether slopes of the plant are those with the effects in place."""
     held: tuple[Vector, ...] = ()
     """Parameters of `WhiteAR1` of each response axis, (3,), in place of the posterior's noise; or none."""
+    begun: bool = False
+    """Whether a descent with effects keeps the slopes that it begins with: near an optimum they hardly
+    change, and cost several times what a response does."""
 
     @cached_property
     def columns(self) -> list[int]:
@@ -291,6 +294,9 @@ class LeastSquares:
         """
         if self.posterior.simulation is None:
             return apart(lambda x: self.residual(x, values), start)
+        if self.begun:
+            slopes = self.residual(start, values)[1]
+            return lambda x: self.misfit(x, values), start, lambda x: slopes
         return lambda x: self.misfit(x, values), start, lambda x: self.residual(x, values)[1]
 
     def noise_fits(self, values: Vector) -> list[NoiseFit]:

@@ -38,6 +38,8 @@ _KEPT = 3
 _DESCENT, _LAST = ((15, 1e-2), (60, 1e-4)), (200, 1e-8)
 """Most responses of each round of a descent, and relative gain of the sum of squares that ends it [-]; of the
 last one, which the best optimum alone has: what a start leads to shows long before its digits do."""
+_BESIDE_START = 2.0
+"""Move of an optimum up to which it has the slopes of where a descent to it began [linearised sd]."""
 _FIRST, _FURTHER, _FINE = 1.5, 1.5, 1e-3
 """First step along an order [linearised sd], factor from one to the next [-], and least distance of an order
 from the ends of its prior, and sd [-]."""
@@ -134,13 +136,17 @@ def _recombined(posterior: Posterior, found: tuple[Optimum, ...]) -> tuple[Optim
 
 
 def again(
-    posterior: Posterior, optima: Sequence[Optimum], crew: Workers[Posterior] | None = None
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+    crew: Workers[Posterior] | None = None,
+    *,
+    begun: bool = False,
 ) -> tuple[Optimum, ...]:
     """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
-    without those of no weight."""
+    without those of no weight. `begun` as `LeastSquares`."""
     best = max(one.log_density for one in optima)
     near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
-    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew))
+    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew, begun=begun))
 
 
 def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
@@ -217,6 +223,22 @@ def _with_spare_terms(posterior: Posterior, found: Sequence[Optimum]) -> list[Ve
     return out
 
 
+def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
+    """The optimum that table values, (rows,), are known to be, with noise fitted to its residual; None where
+    they have no density. What lies beyond an end of its prior is at that end."""
+    problem = LeastSquares(posterior)
+    inside = np.clip(problem.coordinates(values), *problem.bounds_around(values))
+    values = posterior.table.canonical(problem.values(inside, values)[None])[0]
+    values = posterior.complete(posterior.coordinates(values[None]), None)[0]
+    try:
+        values = problem.with_noise(values)
+        _, jacobian = problem.residual(problem.coordinates(values), values)
+    except UnstableError:
+        return None
+    there = _describe(posterior, problem, values, jacobian)
+    return there if np.isfinite(there.log_density) else None
+
+
 def optima_near(posterior: Posterior, starts: Sequence[Vector]) -> tuple[Optimum, ...]:
     """Optima of a posterior with effects that table values `starts`, (rows,) each, lead to, best first,
     duplicates removed."""
@@ -246,35 +268,44 @@ def _descended(
     *,
     rounds: int = 2,
     crew: Workers[Posterior] | None = None,
+    begun: bool = False,
 ) -> list[Optimum]:
     """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
     response gives none."""
-    descend, problem = partial(_descent, rounds), LeastSquares(posterior)
+    descend, problem = partial(_descent, rounds, begun), LeastSquares(posterior)
     ends = map(partial(descend, posterior), starts) if crew is None else crew.each(descend, starts)
     reached = sorted((end for end in ends if end is not None), key=lambda end: -end[0])
     optima = list[Optimum]()
-    for _, values in reached:
+    for _, values, jacobian in reached:
         if not optima and posterior.simulation is None:
             evaluations, enough = _LAST
             values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
         # at the solution itself: its terms may stand in another order than the search left them in, and the
         # noise is that of its own residual
-        _, jacobian = problem.residual(problem.coordinates(values), values)
+        if jacobian is None:
+            _, jacobian = problem.residual(problem.coordinates(values), values)
         optima.append(_describe(posterior, problem, values, jacobian))
     return optima
 
 
-def _descent(rounds: int, posterior: Posterior, values: Vector) -> tuple[float, Vector] | None:
-    """Log density [nat] and table values where a descent from others ends; None where there is no bounded
-    response."""
-    problem = LeastSquares(posterior)
+def _descent(
+    rounds: int, begun: bool, posterior: Posterior, values: Vector
+) -> tuple[float, Vector, Matrix | None] | None:
+    """Log density [nat] and table values where a descent from others ends, and the slopes that it began with
+    if these hold there; None where there is no bounded response."""
+    problem = LeastSquares(posterior, begun=begun)
     values = posterior.complete(posterior.coordinates(values[None]), None)[0]
     try:
         for evaluations, enough in _DESCENT[-rounds:]:
-            values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
+            start = problem.coordinates(values)
+            values, slopes = problem.solve(values, evaluations=evaluations, enough=enough)
+            values = problem.with_noise(values)
     except UnstableError:
         return None
-    return float(posterior.log_density(posterior.coordinates(values[None]))[0]), values
+    moved = float(np.linalg.norm(slopes @ (problem.coordinates(values) - start)))
+    hold = begun and posterior.simulation is not None and moved < _BESIDE_START
+    level = float(posterior.log_density(posterior.coordinates(values[None]))[0])
+    return level, values, slopes if hold else None
 
 
 def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:

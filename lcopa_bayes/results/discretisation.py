@@ -4,25 +4,29 @@ Two measures. Before sampling, at the best least-squares optimum: with W the whi
 whitened Jacobian and d the change of the whitened response on narrower blocks, the optimum moves by
 ``(J' J + prior)^-1 J' d`` to first order. After sampling, at draws of the posterior, whatever its shape:
 draws weighted by the ratio of the likelihoods on narrow and on used blocks have the mean that sampling on
-narrow blocks would have had.
+narrow blocks would have had. Where responses cost much that has a control variate (Owen 2013, Monte Carlo
+theory, methods and examples, 8.9): the same with responses that all change alike, at many draws of a
+surrogate. A few draws on narrow blocks then say how they change, and what is not alike about it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, final
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.estimate import attributes
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import Workers, workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.simulation import Simulated
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 
@@ -50,6 +54,16 @@ _PORTION = 16
 _FIRST, _CLEAR = 32, 0.05
 """Draws that are looked at first, and shift with twice its error below which these are enough [posterior
 sd]."""
+_STAGES = (16, 32, 64, _FEWER)
+"""Draws after which a measurement with a control variate may end."""
+_CONTROLS = 500
+"""Draws at which the control variate is evaluated."""
+_PRECISE = 0.3 * LARGEST
+"""Error, root mean square over parameters, with which such a measurement ends whatever the shifts [posterior
+sd]: that of weighted draws is as large after eight times as many."""
+
+Responses: TypeAlias = Callable[[Matrix], Sequence[Simulated]]
+"""Every record at canonical table values, (batch, rows)."""
 
 
 @final
@@ -154,7 +168,7 @@ def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Proble
     if narrow is problem:
         return problem, tuple(optima)
     with threadpool_limits(1):
-        found = again(narrow.posterior, optima)
+        found = again(narrow.posterior, optima, begun=True)
     return (narrow, found) if problem.ranges is None or not found else resolved_optima(narrow, found)
 
 
@@ -198,25 +212,18 @@ def largest_shift(covariance: Matrix, jacobian: Matrix, changes: Sequence[Vector
     return float(np.max(shifts)) * _REST
 
 
-def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discretisation:
+def discretisation(
+    problem: Problem, draws: Draws, *, surrogate: Responses | None = None, jobs: int = 1
+) -> Discretisation:
     """Shift of the posterior mean of every free parameter on blocks four times narrower; with effects on
-    `jobs` processes."""
+    `jobs` processes, and at fewer draws where a `surrogate` stands for the responses near them."""
     finer, used = problem.refined(FACTORS[-1]).posterior, problem.posterior
-    values = draws.thinned(_DRAWS if used.simulation is None else _FEWER)
     rows = [k for k, row in enumerate(draws.table.rows) if row.free]
-    first = np.arange(len(values)) % max(1, len(values) // _FIRST) == 0
-    values, change = np.concatenate([values[first], values[~first]]), np.empty(0)
     with workers(None, jobs=1 if used.simulation is None else jobs) as crew:
-        for end in dict.fromkeys((int(first.sum()), len(values))):
-            portion = values[len(change) : end]
-            parts = np.array_split(portion, max(1, len(portion) // _PORTION))
-            there, here = (
-                np.concatenate(list(crew.map(each.joint_log_likelihood, parts))) for each in (finer, used)
-            )
-            change = np.append(change, there - here)
-            shifts, errors = _shifts(values[:end, rows], change)
-            if (np.abs(shifts) + 2 * errors).max() < _CLEAR:
-                break
+        if surrogate is None:
+            shifts, errors = _weighted(used, finer, draws, rows, crew)
+        else:
+            shifts, errors = _controlled(used, finer, draws, rows, crew, surrogate)
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
@@ -229,15 +236,135 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
     )
 
 
-def _shifts(columns: Matrix, change: Vector) -> tuple[Vector, Vector]:
+def _weighted(
+    used: Posterior, finer: Posterior, draws: Draws, rows: Sequence[int], crew: Workers[None]
+) -> tuple[Vector, Vector]:
+    """Shifts of free parameters, table `rows`, and their standard errors, by weighted draws."""
+    values = draws.thinned(_DRAWS if used.simulation is None else _FEWER)
+    first = np.arange(len(values)) % max(1, len(values) // _FIRST) == 0
+    values, change = np.concatenate([values[first], values[~first]]), np.empty(0)
+    for end in dict.fromkeys((int(first.sum()), len(values))):
+        portion = values[len(change) : end]
+        parts = np.array_split(portion, max(1, len(portion) // _PORTION))
+        there, here = (
+            np.concatenate(list(crew.map(each.joint_log_likelihood, parts))) for each in (finer, used)
+        )
+        change = np.append(change, there - here)
+        shifts, errors = _shifts(_scaled(values[:end, rows], values[:end, rows]), change)
+        if (np.abs(shifts) + 2 * errors).max() < _CLEAR:
+            break
+    return shifts, errors
+
+
+def _controlled(
+    used: Posterior,
+    finer: Posterior,
+    draws: Draws,
+    rows: Sequence[int],
+    crew: Workers[None],
+    surrogate: Responses,
+) -> tuple[Vector, Vector]:
+    """The same with a control variate; as many draws on narrow blocks as it takes until it is clear what is
+    negligible, or the error is small beside that limit."""
+    assert used.simulation is not None
+    assert finer.simulation is not None
+    values, many = draws.thinned(_FEWER), draws.thinned(_CONTROLS)
+    values = values[_nested(len(values))]
+    near = replace(used, surrogate=surrogate)
+    level, every = near.joint_log_likelihood(many), draws.flat[:, rows]
+    narrow, wide, change = list[Sequence[Simulated]](), list[Sequence[Simulated]](), np.empty(0)
+    for end in (*(stage for stage in _STAGES if stage < len(values)), len(values)):
+        portion = values[len(change) : end]
+        parts = np.array_split(portion, max(2, len(portion) // _PORTION))  # for two processes at least
+        there, here = (list(crew.map(each, parts)) for each in (finer.simulation, used.simulation))
+        narrow, wide = [*narrow, *there], [*wide, *here]
+        for part, after, before in zip(parts, there, here, strict=True):
+            levels = (_given(used, units).joint_log_likelihood(part) for units in (after, before))
+            change = np.append(change, np.subtract(*levels))
+        moved = replace(used, surrogate=_Moved(surrogate, _mean_change(wide, narrow)))
+        own, columns = values[:end], _scaled(values[:end, rows], every)
+        alike = moved.joint_log_likelihood(own) - near.joint_log_likelihood(own)
+        at_many = _shifts(_scaled(many[:, rows], every), moved.joint_log_likelihood(many) - level)
+        unlike = _shifts(columns, change, alike)
+        shifts, errors = at_many[0] + unlike[0], np.hypot(at_many[1], unlike[1])
+        apart = np.abs(np.abs(shifts) - np.array([[LARGEST], [UNUSABLE]])).min(axis=0)
+        if (apart > 2 * errors).all() or np.sqrt(np.mean(errors**2)) < _PRECISE:
+            break
+    return shifts, errors
+
+
+@final
+@dataclass(frozen=True)
+class _Moved:
+    """Responses that all change alike."""
+
+    responses: Responses
+    change: Sequence[Simulated]
+    """Of every record, for a batch of one."""
+
+    def __call__(self, values: Matrix) -> list[Simulated]:
+        """Every record at canonical table values, (batch, rows)."""
+        pairs = zip(self.responses(values), self.change, strict=True)
+        return [
+            Simulated(
+                one.base + by.base,
+                {k: column + by.columns[k] for k, column in one.columns.items()},
+                one.bounded,
+            )
+            for one, by in pairs
+        ]
+
+
+def _given(posterior: Posterior, units: Sequence[Simulated]) -> Posterior:
+    """A posterior whose responses are known, at the plants that they are of."""
+    return replace(posterior, surrogate=lambda values: units)
+
+
+def _mean_change(
+    before: Sequence[Sequence[Simulated]], after: Sequence[Sequence[Simulated]]
+) -> list[Simulated]:
+    """Mean change of the responses of every record, for a batch of one, from several batches of plants; those
+    that are not bounded do not count."""
+    out = []
+    for r in range(len(before[0])):
+        pairs = [(one[r], other[r]) for one, other in zip(before, after, strict=True)]
+        kept = np.concatenate([one.bounded & other.bounded for one, other in pairs])
+        share = kept / max(1, int(kept.sum()))
+        base = np.concatenate([other.base - one.base for one, other in pairs], axis=1)
+        columns = {
+            k: share @ np.concatenate([other.columns[k] - one.columns[k] for one, other in pairs])
+            for k in pairs[0][0].columns
+        }
+        mean = np.einsum("b,abn->an", share, base)[:, None]
+        out.append(Simulated(mean, {k: one[None] for k, one in columns.items()}, np.ones(1, dtype=bool)))
+    return out
+
+
+def _nested(count: int) -> Index:
+    """Positions of draws in an order whose every beginning is spread over all of them."""
+    place = np.arange(count) + _FEWER
+    return np.argsort(-(place & -place), kind="stable")
+
+
+def _scaled(columns: Matrix, every: Matrix) -> Matrix:
+    """Parameters of some draws, less the mean of `every` draw and over their standard deviation."""
+    sd = every.std(axis=0)
+    return np.asarray((columns - every.mean(axis=0)) / np.where(sd > 0, sd, np.inf))
+
+
+def _shifts(scaled: Matrix, change: Vector, than: Vector | None = None) -> tuple[Vector, Vector]:
     """Shifts of means of parameters and their standard errors, by draws (draws, parameters) and what narrower
-    blocks change of their log likelihoods (draws,) [nat]; both (parameters,) [posterior sd]."""
+    blocks change of their log likelihoods (draws,) [nat], over those by another change, by default none; both
+    (parameters,) [posterior sd]."""
+    apart = _weights(change) - (1.0 if than is None else _weights(than))
+    terms = apart[:, None] * scaled
+    return terms.mean(axis=0) * _REST, np.sqrt(np.mean(terms**2, axis=0) / len(terms))
+
+
+def _weights(change: Vector) -> Vector:
+    """Of draws by a change of their log likelihoods, (draws,), 1 on average [-]."""
     weights = np.exp(change - change.max())
-    weights /= weights.sum()
-    sd = columns.std(axis=0)
-    scaled = (columns - columns.mean(axis=0)) / np.where(sd > 0, sd, np.inf)
-    errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
-    return weights @ scaled * _REST, errors
+    return np.asarray(weights / weights.mean())
 
 
 def _negligible(shift: Vector | float, error: Vector | float) -> Flags:

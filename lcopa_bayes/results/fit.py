@@ -220,7 +220,7 @@ def fit(
             log_evidence_sd=weighed.sd if weighed else None,
         )
         draws = draws.limited(check.limitations(draws.grade))
-    width = discretisation(problem, draws, jobs=jobs)
+    width = discretisation(problem, draws, surrogate=run.surrogate, jobs=jobs)
     draws = draws.limited(width.limitations)
     return _derived(problem, run, draws, weighed, width, check, judged=False)
 

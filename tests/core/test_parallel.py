@@ -102,6 +102,38 @@ def test_a_task_that_ends_in_an_error_has_the_result_it_is_given(jobs):
         list(crew.finished(lost, range(3), lambda one, error: one))
 
 
+class Scaled:
+    """A task that knows how often it was pickled, and how often it was read here."""
+
+    read = 0
+
+    def __init__(self, factor):
+        self.factor, self.sent = factor, 0
+
+    def __getstate__(self):
+        self.sent += 1
+        return {"factor": self.factor}
+
+    def __setstate__(self, state):
+        Scaled.read += 1
+        self.factor = state["factor"]
+
+    def __call__(self, one):
+        return self.factor * one, os.getpid(), Scaled.read
+
+
+def test_a_task_is_sent_once_for_all_its_inputs():
+    """And one that takes its place is another, whoever did the first."""
+    with workers(None, jobs=2) as crew:
+        for number, factor in enumerate((2, 3, 2), start=1):
+            task = Scaled(factor)
+            done = list(crew.map(task, range(8)))
+            assert [value for value, _, _ in done] == [factor * one for one in range(8)]
+            assert task.sent == 1
+            assert os.getpid() not in {process for _, process, _ in done}
+            assert max(read for _, _, read in done) <= number
+
+
 def half(one):
     return one / 2 if one else 1 / one
 

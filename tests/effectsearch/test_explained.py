@@ -68,6 +68,26 @@ def test_draws_are_spared_where_normal_ones_about_the_optimum_are_of_no_use(bent
     assert np.abs(normal.std(axis=0) / own.std(axis=0) - 1).max() < 4 / np.sqrt(2 * len(normal))
 
 
+def test_draws_begin_where_the_search_ended(bent: Loop, monkeypatch):
+    """No search for the optimum; without a place to begin there is one, which leads to the same draws."""
+    state, asked = bent.after.state, []
+    names = state.model.posterior.table.names
+    known = dict(zip(names, state.model.values(state.optimum.x).tolist(), strict=True))
+    start = explained.weighted_start
+    monkeypatch.setattr(
+        explained, "weighted_start", lambda *given, **how: asked.append(1) or start(*given, **how)
+    )
+    drawn, searches = [], []
+    for near in (known, None):
+        drawn.append(explained_draws(bent.study, lambda draws, noise: False, near=near, quick=True))
+        searches.append(len(asked))
+    assert searches == [0, 1]
+    rows = [k for k, row in enumerate(drawn[0][0].table.rows) if row.free and not row.noise]
+    flat = [one[0].flat[:, rows] for one in drawn]
+    apart = np.abs(flat[0].mean(axis=0) - flat[1].mean(axis=0)) / flat[1].std(axis=0)
+    assert apart.max() < 0.1
+
+
 def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):
     """Another noise model and a linearisation: within half a standard deviation of each other."""
     state = bent.after.state

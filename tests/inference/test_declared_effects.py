@@ -22,7 +22,7 @@ from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import again, find_optima, known_optimum, nearly_white
 from lcopa_bayes.model.effects import passage
 from lcopa_bayes.model.effects.catalogue import bundled
 
@@ -298,6 +298,50 @@ def test_the_optimum_of_a_simulated_stiffness():
     off = best.values.copy()
     off[k] = 0.0
     assert posterior.log_likelihood(best.values[None])[0] > posterior.log_likelihood(off[None])[0] + 20
+
+
+@pytest.mark.parametrize(("sigma", "evaluated"), [(2e-3, 1), (2e-4, 2)])
+def test_a_descent_beside_an_optimum_keeps_the_slopes_it_begins_with(monkeypatch, sigma, evaluated):
+    """To the optimum on blocks four times narrower as with slopes from everywhere; where it moves by several
+    standard deviations slopes are taken anew there."""
+    base = one_axis(camera=0.3)
+    base = replace(base, model=replace(base.model, blocks=2))
+    made, _ = with_effect(base, ["cubic_stiffness"], PLANT | {"sigma": sigma, "coefficient": 0.3})
+    wide = problem_of(made)
+    first, narrow = find_optima(wide.posterior, np.random.default_rng(1), starts=2)[0], wide.refined(4)
+    exact = again(narrow.posterior, [first])[0]
+    actual, calls = LeastSquares.residual, []
+    monkeypatch.setattr(LeastSquares, "residual", lambda *given: calls.append(1) or actual(*given))
+    found = again(narrow.posterior, [first], begun=True)[0]
+    assert len(calls) == evaluated
+    points = [narrow.posterior.coordinates(one.values[None])[0] for one in (exact, found, first)]
+    sd = np.sqrt(np.diag(exact.covariance))
+    assert np.abs((points[2] - points[0]) / sd).max() > (0.2 if evaluated == 1 else 2.0)
+    assert np.abs((points[1] - points[0]) / sd).max() < 0.1
+    assert_allclose(np.sqrt(np.diag(found.covariance)), sd, rtol=0.1)
+
+
+def test_an_optimum_that_is_known_is_described_without_a_descent(monkeypatch: pytest.MonkeyPatch):
+    """Its noise is that of its residual, wherever that stood; without a bounded response it is none."""
+    made, _ = with_effect(one_axis(), ["cubic_stiffness"], PLANT | {"coefficient": 0.3})
+    posterior = problem_of(made).posterior
+    best = find_optima(posterior, np.random.default_rng(1), starts=2)[0]
+    monkeypatch.setattr(LeastSquares, "solve", None)  # no call of it would end
+    off = nearly_white(posterior, best.values[None])[0]
+    assert not np.allclose(off, best.values)
+    known = known_optimum(posterior, off)
+    assert known is not None
+    assert_allclose(known.values, best.values, rtol=1e-3)
+    assert_allclose(known.covariance, best.covariance, rtol=1e-2, atol=1e-12)
+    assert known.log_density == pytest.approx(best.log_density, abs=1e-3)
+    off[posterior.table.names.index("cubic_stiffness.c")] = -300.0
+    assert known_optimum(posterior, off) is None
+    early = best.values.copy()
+    k = posterior.table.at("delay", 0)
+    early[k] = -0.1  # beyond the end of its prior
+    there = known_optimum(posterior, early)
+    assert there is not None
+    assert 0.0 <= there.values[k] < 1e-3
 
 
 def test_starts_far_below_the_best_are_not_followed(monkeypatch: pytest.MonkeyPatch):
