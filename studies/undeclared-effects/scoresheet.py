@@ -28,7 +28,7 @@ PATHS = {"steady_state": "steady states"} | {
 """The same of the paths of foreign plants."""
 
 
-def bounds(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+def bounds(hits: float, trials: float, level: float = 0.95) -> tuple[float, float]:
     """Two-sided Clopper-Pearson interval of a share [-]."""
     tail = (1 - level) / 2
     low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
@@ -45,6 +45,19 @@ def first_of(row: Row) -> str:
         if made:
             return str(made[0][0][0])
     return ""
+
+
+def independent(held: Sequence[Sequence[bool]]) -> float:
+    """Independent trials that know the share of hits of all campaigns as well as theirs do [-].
+
+    What numbers of one campaign have in common makes the shares of campaigns scatter by more than chance
+    (Kish 1965, Survey Sampling, 5.4). Between the number of campaigns and that of all trials.
+    """
+    hits, sizes = (np.array([float(f(one)) for one in held if one]) for f in (sum, len))
+    trials, most = sizes.sum(), sizes.size
+    value = hits.sum() / trials
+    spread = ((hits - value * sizes) ** 2).sum() / trials**2 * most / max(most - 1, 1)
+    return float(np.clip(value * (1 - value) / spread if spread else most, most, trials))
 
 
 def share(
@@ -111,7 +124,7 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
     plants = [row for row in corrected if not row["disturbance"]]
     ratio = [_ratio(row) for row in plants]
     over = [row["after"]["fit_over_noise"] for row in [*by["clean"], *plants]]
-    inside = targets["coverage"]
+    clean, inside = [row for row in usable if row["verdict"] == "clean"], targets["coverage"]
     return [
         share(
             "false alarms, white noise",
@@ -206,7 +219,8 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
         number(
             "90 % bands before correction", [r["coverage_before"] for r in corrected], np.mean, 0.0, "least"
         ),
-        *intervals("clean", [r for r in usable if r["verdict"] == "clean"], "plant_after", targets),
+        *intervals("nothing hidden", [r for r in clean if not r["truth"]], "plant_after", targets),
+        *intervals("clean, an effect hidden", [r for r in clean if r["truth"]], "plant_after", targets),
         *intervals("heavy-tailed", by["heavy"], "plant_after", targets),
         *intervals("corrected", plants, "plant_after", targets),
         *intervals("corrected, final model alone", plants, "plant_alone", None),
@@ -288,22 +302,26 @@ def intervals(
     targets: Mapping[str, Any] | None,
     kinds: Mapping[str, str] = FIGURES,
 ) -> list[dict[str, Any]]:
-    """Lines of the sheet: how often intervals of numbers of these kinds hold those of the device; numbers of
-    one campaign count as independent. Without `targets` the shares are reported only."""
+    """Lines of the sheet: how often intervals of numbers of these kinds hold those of the device. Without
+    `targets` the shares are reported only."""
     out = []
     for level, key in ((0.5, "intervals_50"), (0.9, "intervals_90")):
         width = float(norm.ppf(0.5 + level / 2))
         for kind, plural in kinds.items():
-            values = [z for row in rows for what, z in row[when].items() if what.startswith(kind)]
-            out.append(
-                share(
-                    f"{100 * level:.0f} % intervals of the {plural}, {name}",
-                    values,
-                    lambda z, width=width: abs(z) <= width,
-                    targets[key] if targets else 0.0,
-                    "within" if targets else "least",
-                )
+            held = [
+                [abs(z) <= width for what, z in row[when].items() if what.startswith(kind)] for row in rows
+            ]
+            line = share(
+                f"{100 * level:.0f} % intervals of the {plural}, {name}",
+                [one for own in held for one in own],
+                bool,
+                targets[key] if targets else 0.0,
+                "within" if targets else "least",
             )
+            if line["trials"]:
+                count = independent(held)
+                line["lower"], line["upper"] = bounds(line["value"] * count, count)
+            out.append(line)
     return out
 
 

@@ -159,7 +159,7 @@ def test_lines_of_foreign_plants_are_counted() -> None:
     assert lines["an effect named, foreign plants"]["value"] == pytest.approx(1 / 4)
     assert lines["90 % intervals of the delays, foreign plants"]["value"] == 0.0
     assert lines["50 % intervals of the values at record end, foreign plants"]["value"] == 1.0
-    assert lines["90 % intervals of the delays, clean"]["trials"] == 0
+    assert lines["90 % intervals of the delays, nothing hidden"]["trials"] == 0
 
 
 def test_one_foreign_campaign_of_four_hides_an_effect_and_every_plant_has_some() -> None:

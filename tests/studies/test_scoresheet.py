@@ -166,6 +166,17 @@ def test_the_place_of_a_truth_is_positive_where_values_lie_above_it() -> None:
     assert devicetruth.place(np.full(9, np.inf), np.inf) == pytest.approx(0.0)
 
 
+def test_numbers_of_one_campaign_count_as_far_as_they_differ() -> None:
+    """Copies count once; what has nothing in common counts by itself."""
+    rng = np.random.default_rng(0)
+    hits = rng.random((2_000, 4)) < 0.9
+    assert scoresheet.independent(hits.tolist()) == pytest.approx(8_000, rel=0.1)
+    copies = np.repeat(hits[:, :1], 4, axis=1).tolist()
+    assert scoresheet.independent(copies) == pytest.approx(2_000, rel=0.01)
+    assert scoresheet.independent([[True] * 4] * 5) == 5
+    assert scoresheet.independent([[True, False], []]) == 1
+
+
 def test_heavy_tailed_noise_keeps_its_size_and_correlation() -> None:
     rng = np.random.default_rng(2)
     noise = rng.normal(size=(400_000, 1))
