@@ -320,7 +320,8 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
     """
     posterior, scales = problem.posterior, problem.scales
     assert isinstance(posterior.noise, GaussianNoise)
-    first, last = np.log(_INSTANT * scales.period), np.log(_LONGEST * scales.span)
+    first = np.log(_INSTANT * scales.period)
+    last = np.log(_LONGEST * max(scales.span, scales.period))
     log_times = np.linspace(first, last, max(8, round(_PER_DECADE * (last - first) / np.log(10)) + 1))
     offsets = [k for k in posterior.table.of_kind("offset") if posterior.table.rows[k].response == axis]
     offsets = [k for k in offsets if posterior.table.rows[k].free]

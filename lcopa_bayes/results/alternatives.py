@@ -108,7 +108,7 @@ class Alternatives:
         moved = [one.estimate for one in self.numbers if one.weight == 0.5 and one.moved]
         moved = [one for one in moved if one.name in names]
         if moved:
-            said = [f"{one.name} at {one.lower:.4g} to {one.upper:.4g} {one.unit}" for one in moved]
+            said = [f"{one.name} at {one.lower:.3g} to {one.upper:.3g} {one.unit}" for one in moved]
             concerned = dict.fromkeys(parameter for one in moved for parameter in names[one.name])
             out.append(
                 Limitation(
