@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any, TypeAlias
 from jinja2 import UndefinedError
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.plot.rundata import RunData, load_run
 from lcopa_bayes.plot.theme import look
 from lcopa_bayes.report import (
@@ -32,6 +30,7 @@ from lcopa_bayes.report import (
 )
 from lcopa_bayes.report.answers import answers
 from lcopa_bayes.report.page import Drawings, Verdict, write_page
+from lcopa_bayes.report.rules import rules
 from lcopa_bayes.results.result import Fresh
 from lcopa_bayes.results.stored import stored_values
 
@@ -55,11 +54,10 @@ def write_report(folder: Path, fresh: Fresh | None = None, halves: Sequence[Draw
     """
     with _complete(folder / "results.json", "fit"):
         run = load_run(folder, fresh)
-    rules = inspect.cleandoc(defaultpriors.__doc__ or "")
 
     def drawn(*_: object) -> Drawings:
         figures = halves or [_figures(run, parts) for parts in _HALVES]
-        return {key: one for half in figures for key, one in half.items()} | {"run": run, "rules": rules}
+        return {key: one for half in figures for key, one in half.items()} | {"run": run, "rules": rules()}
 
     return _written(folder, "fit", "", run.results, drawn)
 
