@@ -291,7 +291,7 @@ def _looped(
     if named:
         factors = state.model.wider
         verdict = widened(verdict, {name: factors[name] for name in _names(state) if name in factors})
-    if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].trace.alarmed:
+    if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].alarmed:
         white = state.whitening  # something significant remains, which bands have to hold
         state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
     sampled = None
@@ -356,8 +356,8 @@ def _findings(
         was, now = without_outliers(was, now)
     return Findings(
         cautions=cautions,
-        alarmed=first.alarmed or bool(added),
-        largest=first.largest,
+        alarmed=searched.rounds[0].alarmed or bool(added),
+        largest=searched.rounds[0].largest,
         threshold=first.threshold,
         effects=names,
         dynamics=len(names) < len(added),

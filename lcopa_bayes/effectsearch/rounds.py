@@ -57,6 +57,19 @@ class Round:
     """Candidates that could not be refitted, and why."""
     chosen: Refit | None
 
+    @property
+    def largest(self) -> float:
+        """Largest log Bayes factor of an effect that changes the response, of one that was refitted that of
+        its refit, which the straight line of the trace only estimates [nat]; -inf without any."""
+        known = {one.added[0]: one.log_bayes_factor for one in self.refits if len(one.added) == 1}
+        changing = (one for one in self.trace.traced if not one.scatters)
+        return max((known.get(one.name, one.log_bayes_factor) for one in changing), default=-np.inf)
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether that is above what chance gives."""
+        return self.trace.alarmed and self.largest > self.trace.threshold
+
 
 @final
 @dataclass(frozen=True, eq=False)

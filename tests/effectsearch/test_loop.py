@@ -21,6 +21,7 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import log_scores, risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import COVERED, Findings, Miss, decide
@@ -353,6 +354,22 @@ FOUND = Findings((), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0
 )
 def test_the_verdict_follows_from_what_was_found(change, kind):
     assert decide(replace(FOUND, **change)).kind == kind
+
+
+def test_an_alarm_of_the_trace_must_hold_against_the_refit():
+    """Straight lines gave 3.3 nat where chance gives 3.2; what was not refitted keeps what they gave."""
+
+    def alarmed(refitted: float, *others: tuple[str, float, bool]) -> bool:
+        traced = [SimpleNamespace(name="a", log_bayes_factor=3.3, scatters=False)]
+        traced += [SimpleNamespace(name=n, log_bayes_factor=b, scatters=s) for n, b, s in others]
+        seen = SimpleNamespace(traced=traced, threshold=3.2, alarmed=True)
+        refit = SimpleNamespace(added=("a",), log_bayes_factor=refitted)
+        return Round(seen, (refit,), (), None).alarmed
+
+    assert alarmed(3.21)
+    assert not alarmed(3.19)
+    assert alarmed(3.19, ("b", 3.21, False))
+    assert not alarmed(3.19, ("b", 9.0, True))  # noise that is not normal changes no response
 
 
 def test_why_nothing_is_named_is_said():
