@@ -89,13 +89,11 @@ class _Later:
 class _Tasks:
     """Tasks as they are sent to workers: pickled once for all inputs, with what they have cached."""
 
-    def __init__(self) -> None:
-        self._task: object = None
-        self._sent: tuple[int, bytes | None] = (0, None)
+    _task: object = None
+    _sent: tuple[int, bytes | None] = (0, None)
 
     def sent(self, task: object) -> tuple[int, bytes | None]:
-        """The number of a task, by which a worker knows the one it did last, and its pickle; None where
-        another process could not read it."""
+        """Number of a task, by which a worker knows the one it did last, and its pickle, as `packed`."""
         if task is not self._task:
             self._task, self._sent = task, (self._sent[0] + 1, packed(task))
         return self._sent
@@ -392,8 +390,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-_latest: tuple[int, Any] = (0, None)
-"""Number of the task that this worker process did last, and the task."""
+_latest: tuple[int, Any] = (0, None)  # number of the task that this worker did last, and the task
 
 
 def _perform(number: int, work: bytes, given: bytes) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.poles import regressed
@@ -29,12 +29,6 @@ _HOPELESS = 300.0
 """The same of a start that slopes of the plant alone led to, which end some nats below the optimum [nat]."""
 _DISTINCT = 0.5
 """Starts closer than this in every sampled coordinate count as one [natural log, or sd of the prior]."""
-_PLANTS = 3
-"""Optima of the plant alone from which effects are started [-]."""
-_TRIED = 48
-"""Sets of internal constants whose slopes are compared [-]."""
-_KEPT = 3
-"""Sets of them that are descended from [-]."""
 _DESCENT, _LAST = ((15, 1e-2), (60, 1e-4)), (200, 1e-8)
 """Most responses of each round of a descent, and relative gain of the sum of squares that ends it [-]; of the
 last one, which the best optimum alone has: what a start leads to shows long before its digits do."""
@@ -52,8 +46,6 @@ _CONSTANT, _BARELY = 0.1, 0.02
 """Order below which a term is nearly a constant, and that of one which is to become one [-]."""
 _BESIDE = (0.9, 0.3)
 """Order and time of a constant that is to become a term, over those of the term before [-]."""
-_HARDLY = 1e-2
-"""Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
 
 @final
@@ -88,7 +80,7 @@ def find_optima(
     table = posterior.table
     if posterior.simulation is not None:
         alone = find_optima(posterior.without_effects, rng, starts=starts)
-        return optima_near(posterior, effect_starts(posterior, alone, rng))
+        return optima_near(posterior, effect_starts(posterior, [one.values for one in alone], rng))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
     each = posterior.log_likelihoods(drawn)
@@ -367,55 +359,3 @@ def _describe(posterior: Posterior, problem: LeastSquares, values: Vector, jacob
         at = [posterior.sampled.index(k) for k in shared]
         covariance[np.ix_(at, at)] = block[np.ix_(inside, inside)]
     return Optimum(values, covariance, float(posterior.log_density(coordinates)[0]))
-
-
-def effect_starts(posterior: Posterior, alone: Sequence[Optimum], rng: np.random.Generator) -> list[Vector]:
-    """Table values with every effect nearly vanishing, beside the best optima of the plant `alone`.
-
-    Internal constants that are free are drawn from their priors; those are kept whose effects take up most of
-    the residual to first order, what the plant can imitate of them aside.
-    """
-    rows = posterior.table.rows
-    plant = [k for k, row in enumerate(rows) if row.kind not in (*COEFFICIENTS, *CONSTANTS)]
-    free = [k for k, row in enumerate(rows) if row.kind in CONSTANTS and row.free]
-    out: list[Vector] = []
-    for optimum in alone[:_PLANTS]:
-        start = np.array([row.value for row in rows])
-        start[plant] = optimum.values
-        for k, row in enumerate(rows):
-            if row.kind in COEFFICIENTS and row.prior is not None:
-                small = _HARDLY * float(row.prior.frozen.std()) if row.kind == "magnitude" else 0.0
-                start[k] = small if row.prior.support[0] <= small else float(row.prior.frozen.median())
-        out += _with_constants(posterior, start, free, rng) if free else [start]
-    return out
-
-
-def _with_constants(
-    posterior: Posterior, start: Vector, free: list[int], rng: np.random.Generator
-) -> list[Vector]:
-    """The start with constants that promise most."""
-    rows = posterior.table.rows
-    tried = np.tile(start, (_TRIED, 1))
-    for k in free:
-        tried[:, k] = rows[k].draw(_TRIED, rng)
-    gains = np.array([_gain(posterior, values) for values in tried])
-    order = np.argsort(-gains, kind="stable")
-    return [tried[k] for k in order[:_KEPT]]
-
-
-def _gain(posterior: Posterior, values: Vector) -> float:
-    """Squared whitened residual that the effects take up to first order beyond the plant [-]."""
-    least, kinds = LeastSquares(posterior, exact=False), [row.kind for row in posterior.table.rows]
-    try:
-        residual, jacobian = least.residual(least.coordinates(values), values)
-    except UnstableError:
-        return -np.inf
-    own = [p for p, k in enumerate(least.columns) if kinds[k] in COEFFICIENTS]
-    plant = [p for p, k in enumerate(least.columns) if kinds[k] not in (*COEFFICIENTS, *CONSTANTS)]
-    unexplained = residual - _fitted(jacobian[:, plant], residual)
-    whole = residual - _fitted(jacobian[:, [*plant, *own]], residual)
-    return float(unexplained @ unexplained - whole @ whole)
-
-
-def _fitted(columns: Matrix, target: Vector) -> Vector:
-    return np.asarray(columns @ np.linalg.lstsq(columns, target, rcond=None)[0])
