@@ -43,15 +43,17 @@ def again(bent: Loop, tmp_path_factory: pytest.TempPathFactory) -> Fit:
 
 
 def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, again: Fit):
-    """Its own search ends where the loop's does, but for the last digits: a tenth of a standard deviation."""
+    """Draws of both are independent: four standard errors of a normal distribution's quantiles."""
     reported = {one.name: one for one in again.draws.estimates()}
     model = bent.after.state.model
     assert bent.names == ("odd_curvature",)
     for k in range(len(model.names)):
         own = bent.estimate(k)
         there = reported[own["name"]]
-        near = 0.1 * (there.upper - there.lower) / (2 * 1.645)
-        assert own["alone"] == pytest.approx([there.lower, there.value, there.upper], abs=near), own["name"]
+        sd = (there.upper - there.lower) / (2 * 1.645)
+        error = sd * np.sqrt(1 / there.ess + 1 / own["ess"]) * np.array([2.11, 1.25, 2.11])
+        apart = np.array(own["alone"]) - [there.lower, there.value, there.upper]
+        assert (np.abs(apart) < 4 * error).all(), own["name"]
 
 
 def test_draws_are_spared_where_normal_ones_about_the_optimum_are_of_no_use(bent: Loop, monkeypatch):
@@ -69,7 +71,8 @@ def test_draws_are_spared_where_normal_ones_about_the_optimum_are_of_no_use(bent
 
 
 def test_draws_begin_where_the_search_ended(bent: Loop, monkeypatch):
-    """No search for the optimum; without a place to begin there is one, which leads to the same draws."""
+    """No search for the optimum; without a place to begin there is one, which leads to the same draws: a
+    descent ends where no step gains 0.02 nat, a fifth of a standard deviation from the optimum."""
     state, asked = bent.after.state, []
     names = state.model.posterior.table.names
     known = dict(zip(names, state.model.values(state.optimum.x).tolist(), strict=True))
@@ -85,7 +88,7 @@ def test_draws_begin_where_the_search_ended(bent: Loop, monkeypatch):
     rows = [k for k, row in enumerate(drawn[0][0].table.rows) if row.free and not row.noise]
     flat = [one[0].flat[:, rows] for one in drawn]
     apart = np.abs(flat[0].mean(axis=0) - flat[1].mean(axis=0)) / flat[1].std(axis=0)
-    assert apart.max() < 0.1
+    assert apart.max() < 0.2 + 4 * np.sqrt(2 / len(flat[0]))
 
 
 def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):
