@@ -60,7 +60,7 @@ _CONTROLS = 500
 """Draws at which the control variate is evaluated."""
 _PRECISE = 0.3 * LARGEST
 """Error, root mean square over parameters, with which such a measurement ends whatever the shifts [posterior
-sd]: that of weighted draws is as large after eight times as many."""
+sd]. On the bundled `studies/undeclared` 128 weighted draws have 0.027."""
 
 Responses: TypeAlias = Callable[[Matrix], Sequence[Simulated]]
 """Every record at canonical table values, (batch, rows)."""
