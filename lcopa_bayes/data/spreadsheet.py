@@ -16,8 +16,11 @@ import warnings
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from itertools import chain, count, islice, product, zip_longest
 from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -38,6 +41,10 @@ _LONGEST = 100
 """Characters of the longest number, time or column name: the time of a search may grow with their square."""
 _SHORT = 4
 """Longest unit without brackets."""
+_WRITTEN_FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
+"""A formula in a part of a workbook."""
+_NAMED = 5
+"""Most cells that a message names."""
 _HEADED = 40
 """Most lines in which a header is looked for."""
 
@@ -105,38 +112,77 @@ def _split(content: bytes, encoding: str, separator: str) -> Iterator[tuple[int,
 
 
 def _workbook(path: Path, sheet: str | None) -> CellTable:
-    from openpyxl import load_workbook  # loaded where a workbook is read, which is rare
-
-    try:
-        values = load_workbook(path, data_only=True)
-        formulas = load_workbook(path, data_only=False)
-    except Exception as error:  # whatever a damaged file leads the library to
-        raise InputError(f"{path}: cannot be read as a workbook ({error}); save it as xlsx or CSV") from None
-    if sheet is not None and sheet not in values.sheetnames:
-        raise InputError(f"{path}: has no sheet {sheet!r}{nearest(sheet, values.sheetnames)}")
-    for name in [sheet] if sheet is not None else values.sheetnames:
-        page, written = values[name], formulas[name]
-        if not hasattr(page, "iter_rows"):
-            continue  # a chart
-        rows, open_formulas = [], []
-        for number, cells in enumerate(page.iter_rows(), start=1):
-            texts = [_cell(cell.value) for cell in cells]
-            if any(texts):
-                rows.append((number, texts))
-            open_formulas += [
-                f"{path}, sheet {name!r}, cell {cell.coordinate}: the formula has no stored result; open and "
-                "save the file in a spreadsheet program, or save values"
-                for cell in cells
-                if cell.value is None and str(written[cell.coordinate].value or "").startswith("=")
-            ]
-        refuse_if(open_formulas[:5])
-        widths = Counter(len([cell for cell in cells if cell]) for _, cells in rows)
-        if rows and max(widths) > 1:
-            return _tabled(path, rows)
-    where = f"{path}, sheet {sheet!r}" if sheet is not None else f"{path}"
-    others = ", ".join(repr(name) for name in values.sheetnames if name != sheet)
+    """Row by row: a million rows held as a workbook's cells take 3 GB."""
+    with closing(_book(path, data_only=True)) as book:
+        if sheet is not None and sheet not in book.sheetnames:
+            raise InputError(f"{path}: has no sheet {sheet!r}{nearest(sheet, book.sheetnames)}")
+        formulas = _has_formulas(path)
+        for name in [sheet] if sheet is not None else book.sheetnames:
+            if not hasattr(book[name], "iter_rows"):
+                continue  # a chart
+            if formulas:
+                refuse_if(list(islice(_open_formulas(path, name), _NAMED)))
+            texts = ((n, [_cell(cell.value) for cell in cells]) for n, cells in _rows(path, book[name]))
+            rows = ((number, cells) for number, cells in texts if any(cells))
+            head = list(islice(rows, _HEADED + 1))
+            if max((_filled(cells) for _, cells in head), default=0) > 1:
+                width = max(len(cells) for _, cells in head)  # a column may have no name
+                whole = ((n, [*cells, *[""] * (width - len(cells))]) for n, cells in chain(head, rows))
+                return _tabled(path, whole)
+        where = f"{path}, sheet {sheet!r}" if sheet is not None else f"{path}"
+        others = ", ".join(repr(name) for name in book.sheetnames if name != sheet)
     more = f"; the other sheets are {others}" if sheet is not None and others else ""
     raise InputError(f"{where}: holds no table; expected a header and rows of numbers{more}")
+
+
+def _book(path: Path, *, data_only: bool) -> Any:
+    """A workbook that is read where it is asked for a row; with the results of formulas, or these."""
+    from openpyxl import load_workbook  # loaded where a workbook is read, which is rare
+
+    with _sound(path):
+        return load_workbook(path, data_only=data_only, read_only=True)
+
+
+def _rows(path: Path, page: Any) -> Iterator[tuple[int, Sequence[Any]]]:
+    """Numbers and cells of the rows of a sheet, each up to its last cell."""
+    page.reset_dimensions()  # what a program states of them may be wrong
+    with _sound(path):
+        yield from enumerate(page.iter_rows(), start=1)
+
+
+@contextmanager
+def _sound(path: Path) -> Iterator[None]:
+    """Within it, whatever a damaged file leads the library to becomes an InputError."""
+    try:
+        yield
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read as a workbook ({error}); save it as xlsx or CSV") from None
+
+
+def _has_formulas(path: Path) -> bool:
+    """Whether any part of a workbook may hold a formula: to read all cells a second time takes minutes."""
+    with _sound(path), ZipFile(path) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as part:
+                end = b""
+                while piece := part.read(1 << 20):
+                    if _WRITTEN_FORMULA.search(end + piece):
+                        return True
+                    end = piece[-_LONGEST:]
+    return False
+
+
+def _open_formulas(path: Path, name: str) -> Iterator[str]:
+    """What is wrong with formulas of a sheet that have no stored result."""
+    with closing(_book(path, data_only=True)) as values, closing(_book(path, data_only=False)) as written:
+        both = (_rows(path, book[name]) for book in (values, written))
+        for (_, cells), (_, formulas) in zip(*both, strict=True):
+            for cell, formula in zip(cells, formulas, strict=True):
+                if cell.value is None and str(formula.value or "").startswith("="):
+                    yield (
+                        f"{path}, sheet {name!r}, cell {formula.coordinate}: the formula has no stored "
+                        "result; open and save the file in a spreadsheet program, or save values"
+                    )
 
 
 def _cell(value: object) -> str:

@@ -232,7 +232,7 @@ def _verdict(values: Mapping[str, Any]) -> str:
     for one in values["shares"][:_NAMED]:
         ends = f"90 % interval {100 * one['lower']:.0f} to {100 * one['upper']:.0f} %"
         parts.append(f"{one['name']}: {one['devices']} devices, {100 * one['share']:.0f} % ({ends}).")
-    failed = [row["device"] for row in rows if row["grade"] == "failed"]
-    if failed:
-        parts.append(f"Failed: {listed(failed, _NAMED)}.")
+    failed = {row["device"]: row["reason"] for row in rows if row["grade"] == "failed"}
+    for name in list(failed)[:1]:
+        parts.append(f"Failed: {listed(list(failed), _NAMED)}; {name}: {failed[name].rstrip('.')}.")
     return " ".join(parts)

@@ -114,6 +114,11 @@ class Fit(Predictive):
 
     def to_json(self) -> dict[str, Any]:
         """Every number of the fit as plain values; see `summary.results`."""
+        return dict(self._values)
+
+    @cached_property
+    def _values(self) -> dict[str, Any]:
+        """Asked for when a fit is saved, and by whoever looks at it then."""
         return results(self)
 
     def to_datatree(self) -> DataTree:

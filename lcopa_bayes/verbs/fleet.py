@@ -210,6 +210,7 @@ def fleet(
         opened(place, origin) as path,
     ):
         work = _Work(verb, path.resolve(), quick, resume)
+        writable_folder(path / _DEVICES)  # or every device would fail for it
         stored = {study.name: work.done(study) for _, study in members}
         outcomes += [one for one in stored.values() if one is not None]
         missing = [one for one in members if stored[one[1].name] is None]

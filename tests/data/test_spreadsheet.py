@@ -5,9 +5,12 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import re
 import time
+import tracemalloc
 from contextlib import suppress
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -129,6 +132,42 @@ def test_a_formula_without_a_stored_result_is_named_by_its_cell(tmp_path):
     book.save(tmp_path / "x.xlsx")
     with pytest.raises(InputError, match="cell C2: the formula has no stored result"):
         read_spreadsheet(tmp_path / "x.xlsx")
+
+
+def test_formulas_with_results_are_read(tmp_path):
+    """What a spreadsheet program has saved: the formula and its result."""
+    book = Workbook()
+    book.active.append(["t [s]", "u", "y"])
+    for k in range(5):
+        book.active.append([k, 1.0, 900.0 + k])
+    book.save(tmp_path / "x.xlsx")
+    with ZipFile(tmp_path / "x.xlsx") as saved, ZipFile(tmp_path / "y.xlsx", "w") as other:
+        for name in saved.namelist():
+            content = re.sub(rb"<v>(90\d)</v>", rb"<f>800+100</f><v>\1</v>", saved.read(name))
+            other.writestr(name, content)
+    assert list(read_spreadsheet(tmp_path / "y.xlsx").columns[2]) == [f"90{k}" for k in range(5)]
+
+
+def test_a_workbook_is_read_row_by_row(tmp_path):
+    """Not held as cells, which take 3 kB a row; nor cut off where the stated dimension is wrong, and a column
+    without a name stays."""
+    count, book = 4_000, Workbook()
+    book.active.append(["t [s]", "u"])
+    for k in range(count):
+        book.active.append([k, k % 2, 0.5 * k])
+    book.save(tmp_path / "x.xlsx")
+    with ZipFile(tmp_path / "x.xlsx") as saved, ZipFile(tmp_path / "y.xlsx", "w") as other:
+        for name in saved.namelist():
+            other.writestr(name, saved.read(name).replace(b'ref="A1:C4001"', b'ref="A1"'))
+    read_spreadsheet(tmp_path / "x.xlsx")  # the library is loaded
+    tracemalloc.start()
+    table = read_spreadsheet(tmp_path / "y.xlsx")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert table.names == ["t [s]", "u", "column 3"]
+    assert [len(one) for one in table.columns] == [count] * 3
+    assert table.columns[2][-1] == "1999.5"
+    assert peak < 1_500 * count
 
 
 def test_date_and_time_of_day_may_stand_in_two_columns(tmp_path):

@@ -21,6 +21,7 @@ from lcopa_bayes.data.studywriter import write_folder
 from lcopa_bayes.fleets.devices import row_of
 from lcopa_bayes.fleets.summary import _shares, results
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.results import fit as fits
 from lcopa_bayes.verbs import fleet as verb
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "studies" / "fleet"))
@@ -81,7 +82,8 @@ def test_a_fleet_is_one_table_and_its_population(fleet, out):
     assert 1.8 < rows.loc["gain", "mean"] < 2.2
     assert rows.loc["time_1", "mean"] == pytest.approx(1.5, rel=0.1)
     assert rows.loc["time_1", "unit"] == "ms"
-    assert "Failed: broken" in fleet.verdict
+    assert "Failed: broken; broken: " in fleet.verdict
+    assert "`terms` must be" in fleet.verdict
     read = pd.read_parquet(out / "tables" / "fleet.parquet")
     pd.testing.assert_frame_equal(read, fleet.summary(), check_dtype=False)
     kept = lb.load_result(out / "devices" / "a")
@@ -120,6 +122,21 @@ def test_finished_devices_are_kept_until_their_study_changes(devices, out, fleet
     assert after.to_json() != fleet.to_json()
     assert not origin.exists()
     assert [one.name for one in studies] == list(GAINS)
+
+
+def test_the_numbers_of_a_device_are_computed_once(devices, tmp_path, monkeypatch):
+    counts, compute = [], fits.results
+    monkeypatch.setattr(fits, "results", lambda fit: counts.append(fit.study.name) or compute(fit))
+    row = lb.fleet([devices / "a"], folder=tmp_path).summary().iloc[0]
+    assert counts == ["a"]
+    assert row["gain"] == lb.load_result(tmp_path / "devices" / "a").to_json()["parameters"][0]["value"]
+
+
+def test_a_folder_that_takes_no_devices_is_refused_once(devices, tmp_path):
+    (tmp_path / "devices").write_text("")
+    with pytest.raises(lb.InputError, match="devices: the output folder cannot be written to") as caught:
+        lb.fleet(devices, folder=tmp_path)
+    assert len(caught.value.problems) == 1
 
 
 def without_times(fleet: lb.FleetResult) -> dict:
