@@ -1,7 +1,7 @@
 """What `fit`, `loop` and `compare` say of every measured record: one table.
 
-    python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--jobs N] [--limit SECONDS]
-        [--out FOLDER]
+    python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--verbs VERB ...] [--jobs N]
+        [--limit SECONDS] [--out FOLDER]
 
 Every folder of records is fitted, looped and compared with the study file it comes with, the structure left
 to the records where that file does not state it. Finished rows are kept in the folder: a killed run goes on
@@ -164,6 +164,7 @@ def main() -> None:
     )
     parser.add_argument("--records", type=Path, default=RECORDS)
     parser.add_argument("--only", nargs="*")
+    parser.add_argument("--verbs", nargs="*", choices=VERBS, default=VERBS)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, default=1800)
     parser.add_argument("--out", type=Path, default=Path("reports/measured"))
@@ -171,7 +172,7 @@ def main() -> None:
     folders = sorted(path.parent for path in options.records.glob("*/study.toml"))
     folders = [path for path in folders if not options.only or path.name in options.only]
     kept = writable_folder(writable_folder(options.out) / "rows")
-    tasks = [(str(folder), verb) for folder in folders for verb in VERBS]
+    tasks = [(str(folder), verb) for folder in folders for verb in options.verbs]
     done = {}
     for folder, verb in tasks:
         path = kept / f"{Path(folder).name}.{verb}.json"
