@@ -38,8 +38,8 @@ from lcopa_bayes.effectsearch.openeffects import (
 )
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
+from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.refits import released
-from lcopa_bayes.effectsearch.richerplants import RicherPlants
 from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
 from lcopa_bayes.effectsearch.scores import (
     Score,
@@ -122,8 +122,8 @@ class Loop:
     """Effects that the records leave open beside, or in place of, those of the final model."""
     lags: tuple[SumOfLags, ...] = ()
     """Sums of lags beside the plant of the final model, where the search chose its structure."""
-    richer: RicherPlants = field(default_factory=RicherPlants)
-    """Plants that contain that of the final model, where the search chose its structure."""
+    plants: PlantsBeside = field(default_factory=PlantsBeside)
+    """Plants beside that of the final model, where the search chose its structure."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -165,7 +165,7 @@ class Loop:
         own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
         shares = np.array([weight for _, weight in own])
         number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
-        number = self.richer.number(number, row)
+        number = self.plants.number(number, row)
         return number_with_lags(number, row, self.lags, state.model.plant.table.layout)
 
     @cached_property
@@ -174,7 +174,7 @@ class Loop:
         same models."""
         own, layout = (self.figures_of(self.after.state, *self._mixture), self.problem.posterior.table.layout)
         span, unit = self.problem.scales.span, self.problem.study.time_unit
-        own = self.richer.figures(own, span=span, time_unit=unit)
+        own = self.plants.figures(own, span=span, time_unit=unit)
         return figures_with_lags(own, self.lags, layout, span=span, time_unit=unit)
 
     def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
@@ -313,11 +313,12 @@ def _looped(
             after = drawn
     if sampled is None and state is not after.state:
         after = _side(problem, state)
+    beside_it = PlantsBeside.of(state, problem, wider) if chosen else PlantsBeside()
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, lags, RicherPlants.beside(state, wider)),
+        *(outliers, contrary, found, lags, beside_it),
     )
 
 

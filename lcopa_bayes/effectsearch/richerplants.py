@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.effectsearch.openeffects import Weighed, mixture, step_figures
+from lcopa_bayes.effectsearch.openeffects import Weighed
+from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.parameter import Parameter
@@ -29,49 +28,10 @@ hold the steady value 44 times without them, and 52 or 53 times with any weight 
 
 @final
 @dataclass(frozen=True, eq=False)
-class RicherPlant:
-    """A plant that contains the chosen one, with its effects and under its noise."""
-
-    state: State
-    gained: float
-    """Log likelihood over that of the chosen one [nat]."""
-
-    @cached_property
-    def draws(self) -> Matrix:
-        """Normal draws about its optimum inside the support, (draws, coordinates)."""
-        return mixture(self.state, None, ())[0][0]
-
-    def figures(self, *, span: float, time_unit: str) -> dict[str, Vector]:
-        """Those of its response to a unit step over `span` [time unit], by name."""
-        found = step_figures(self.state, [self.draws], np.ones(1), span=span, time_unit=time_unit)
-        return {one.name: one.values for one in found}
-
-    @property
-    def said(self) -> str:
-        """What it is."""
-        elements = self.state.model.plant.table.layout.elements
-        terms, count = max(element.terms for element in elements), len(elements)
-        own = f"{count} elements" if count > 1 else "one element"
-        return (
-            f"a plant of {own} with {terms} {'terms' if terms > 1 else 'term'} (log likelihood higher by "
-            f"{max(self.gained, 0.0):.1f})"
-        )
-
-    def number(self, name: str) -> Vector | None:
-        """A coordinate at the draws; None of one that it does not have."""
-        model = self.state.model
-        if name not in model.names:
-            return None
-        k = model.names.index(name)
-        return model.posterior.table.rows[model.columns[k]].value_at(self.draws[:, k])
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class RicherPlants:
     """All of them beside one final model, and their part in its numbers."""
 
-    plants: tuple[RicherPlant, ...] = ()
+    plants: tuple[OtherPlant, ...] = ()
 
     @classmethod
     def beside(cls, state: State, wider: Sequence[State]) -> RicherPlants:
@@ -85,7 +45,7 @@ class RicherPlants:
             except ArithmeticError:
                 continue
             misfits = (at.white @ at.white for at in (state.optimum, optimum))
-            out.append(RicherPlant(State(model, optimum, state.whitening), float(np.subtract(*misfits)) / 2))
+            out.append(OtherPlant(State(model, optimum, state.whitening), float(np.subtract(*misfits)) / 2))
         return cls(tuple(out))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:
@@ -109,10 +69,21 @@ class RicherPlants:
         if not self.plants:
             return ""
         several = len(self.plants) > 1
-        said = " or ".join(one.said for one in self.plants)
+        said = " or ".join(map(_said, self.plants))
         little = "which have" if several else "which has"
         part = "they have equal parts" if several else "it has a part"
         return (
             f"The records do not reject {said}, {little} too little evidence to be chosen: {part} in gains, "
             f"delays and figures of the step responses, {100 * WEIGHT:.0f} % of the plant's draws."
         )
+
+
+def _said(one: OtherPlant) -> str:
+    """What it is."""
+    elements = one.state.model.plant.table.layout.elements
+    terms, count = max(element.terms for element in elements), len(elements)
+    own = f"{count} elements" if count > 1 else "one element"
+    return (
+        f"a plant of {own} with {terms} {'terms' if terms > 1 else 'term'} (log likelihood higher by "
+        f"{max(one.gained, 0.0):.1f})"
+    )

@@ -54,7 +54,8 @@ def results(result: Loop) -> dict[str, Any]:
         "alternatives": {
             "sums_of_lags": [one.as_json() for one in result.lags],
             "sentence": sentence_of(result.lags),
-            "richer": result.richer.sentence,
+            "richer": result.plants.richer.sentence,
+            "integer_orders": result.plants.integer.sentence if result.plants.integer else "",
         },
         "outliers": result.outliers
         and attributes(result.outliers, "count", "share", "width", "log_bayes_factor", "sentence"),

@@ -17,7 +17,7 @@ from lcopa_bayes.core.estimate import quantile
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch import richerplants
 from lcopa_bayes.effectsearch.loop import Loop, loop
-from lcopa_bayes.effectsearch.richerplants import RicherPlants
+from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.results.structure import with_least_terms
 
 SEED = 982200005
@@ -44,12 +44,12 @@ def test_a_steady_value_beyond_the_record_is_held(found: Loop) -> None:
     true = truths(campaign(KIND, (), SEED), found.problem.scales.span, ())["steady_state[y1]"]
     low, high = ends(found, "steady_state[y1]")
     assert low <= true <= high
-    low, high = ends(replace(found, richer=RicherPlants()), "steady_state[y1]")
+    low, high = ends(replace(found, plants=PlantsBeside()), "steady_state[y1]")
     assert high < true
 
 
 def test_a_richer_plant_contains_the_chosen_one(found: Loop) -> None:
-    (one,) = found.richer.plants
+    (one,) = found.plants.richer.plants
     assert found.verdict.kind == "clean"
     assert one.state.model.plant.table.layout.elements[0].terms == 3
     assert found.problem.posterior.table.layout.elements[0].terms == 2
@@ -80,4 +80,4 @@ def test_its_part_is_the_stated_weight(found: Loop) -> None:
 def test_a_stated_structure_has_none() -> None:
     made = study()
     made = replace(made, model=replace(made.model, terms=2))
-    assert not loop(made, sample=False, as_stated=True).richer.plants
+    assert not loop(made, sample=False, as_stated=True).plants.richer.plants

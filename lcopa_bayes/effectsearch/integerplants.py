@@ -1,0 +1,160 @@
+"""The plant that a loop ends with, its orders held at integers, and its part in the numbers.
+
+Orders 2 and 1 are a corner of the prior: a second-order plant has all of its posterior on one side, orders
+below 2 with a longer delay, and intervals of delay and rise miss it. Whether orders are integers is a
+question of structure like the number of terms: elements whose orders the records let be integers are held
+there, and that plant has a part in gains, delays and figures of the step responses by its evidence, half of
+them at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import exp, log
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.wording import listed
+from lcopa_bayes.data.settings import PriorSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.openeffects import LEAST, Weighed
+from lcopa_bayes.effectsearch.otherplants import OtherPlant
+from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import campaign_places
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.parameters import ParameterTable
+
+_FIRST = (1.0,)
+_SECOND = (2.0, 1.0)
+"""Orders of a lag and of a second-order element, which rings or is a product of two lags [-]."""
+_SHORTER = (1.0, 0.5)
+"""Factors on the delays where a descent begins [-]: orders below those of the plant lengthen them."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class IntegerPlant:
+    """The final plant of a loop with the orders of some elements at integers."""
+
+    plant: OtherPlant
+    orders: dict[str, tuple[float, ...]]
+    """Those of each element that is held, by its name [-]."""
+    log_odds: float
+    """By the Bayesian information criterion, against the plant with free orders [nat]."""
+
+    @property
+    def weight(self) -> float:
+        """Its part beside the chosen plant [-]: half of it where the records do not speak against it."""
+        odds = exp(min(self.log_odds, 0.0))
+        return odds / (1.0 + odds)
+
+    def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:
+        """Figures of the response to a unit step over `span` [time unit], over this plant too."""
+        own = self.plant.figures(span=span, time_unit=time_unit)
+        return tuple(one.beside([own[one.name]], self.weight) if one.name in own else one for one in figures)
+
+    def number(self, number: Weighed, row: Parameter) -> Weighed:
+        """A gain or delay over this plant too; times of unlike orders are not the same numbers."""
+        values = self.plant.number(row.name) if row.kind in ("gain", "delay") else None
+        return number if values is None else number.beside([values], self.weight)
+
+    @property
+    def sentence(self) -> str:
+        """What it is and what part it has."""
+        said = listed(
+            [
+                f"{' and '.join(f'{order:g}' for order in orders)}{f' of {name}' if name else ''}"
+                for name, orders in self.orders.items()
+            ]
+        )
+        return (
+            f"The records do not reject integer orders ({said}; {self.log_odds:+.1f} nat by BIC): a plant "
+            f"with them has {100 * self.weight:.0f} % of the plant's draws in gains, delays and figures of "
+            "the step responses."
+        )
+
+
+def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
+    """The plant of a final state with integer orders of all elements of one or two terms that the records let
+    have them; None without any."""
+    table = state.model.plant.table
+    values = state.model.values(state.optimum.x)
+    orders = dict(_nearest(table, values))
+    if not orders:
+        return None
+    every = _held(state, problem, orders)
+    if every is not None and every.log_odds > 0.0:
+        return every
+    apart = [_held(state, problem, {name: own}) for name, own in orders.items()] if len(orders) > 1 else []
+    borne = [one.orders for one in apart if one is not None and one.log_odds > 0.0]
+    some = {name: own for one in borne for name, own in one.items()}
+    found = [every, *apart, _held(state, problem, some) if len(some) > 1 else None]
+    best = max((one for one in found if one is not None), key=lambda one: one.log_odds, default=None)
+    return best if best is not None and best.log_odds > log(LEAST) else None
+
+
+def _nearest(table: ParameterTable, values: Vector) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Integer orders of each element of one or two free orders, by its name."""
+    for slot, (_, own) in zip(table.layout.elements, table.terms, strict=True):
+        if slot.terms <= len(_SECOND) and all(table.rows[k].free for k in own):
+            yield slot.name, _FIRST if slot.terms == 1 and values[own[0]] <= 1.0 else _SECOND
+
+
+def _held(state: State, problem: Problem, orders: dict[str, tuple[float, ...]]) -> IntegerPlant | None:
+    """The plant with these elements at integer orders; None where it cannot follow the records."""
+    table = state.model.plant.table
+    try:
+        study = _with_orders(problem.study, table, orders)
+        own = problem_of(study)
+        own = own if problem.refinement == 1 else own.refined(problem.refinement)
+        model = ExtendedModel(own.posterior)
+        starts = list(_starts(state, model, orders))
+        model = model.at_scales(starts[0], campaign_places(study)).having(*state.model.effects)
+        model = replace(model, wider=state.model.wider)
+        effects = state.optimum.x[state.model.plant_size :]
+        begin = [np.concatenate([x, effects]) for x in starts]
+        optimum = Regression(model, state.whitening).best(begin)
+    except (ArithmeticError, InputError):
+        return None
+    squares = (at.white @ at.white for at in (state.optimum, optimum))
+    gained = float(np.subtract(*squares)) / 2
+    fewer = state.optimum.x.size - optimum.x.size
+    odds = gained + 0.5 * fewer * log(state.whitening.effective)
+    return IntegerPlant(OtherPlant(State(model, optimum, state.whitening), gained), orders, odds)
+
+
+def _with_orders(study: Study, table: ParameterTable, orders: dict[str, tuple[float, ...]]) -> Study:
+    """The study with elements of these orders."""
+    layout = table.layout
+    terms = {slot.name: len(orders.get(slot.name, ())) or slot.terms for slot in layout.elements}
+    model = study.model.for_plant(len(layout.drives), len(layout.responses))
+    model = replace(model, terms=terms if len(terms) > 1 else next(iter(terms.values())))
+    held = dict[str, PriorSettings]()
+    for name, own in orders.items():
+        for k, order in enumerate(own):
+            full = f"order_{k + 1}_{name}" if name else f"order_{k + 1}"
+            held[full] = PriorSettings(full, fixed=order)
+    return replace(study, model=model, priors={**study.priors, **held})
+
+
+def _starts(state: State, model: ExtendedModel, orders: Collection[str]) -> Iterator[Vector]:
+    """Coordinates of the plant with integer orders near those of the final state, without effects."""
+    old, table = state.model.plant.table, model.plant.table
+    values = state.model.values(state.optimum.x)
+    known = dict(zip(old.names, values, strict=False))
+    for share in _SHORTER:
+        out = np.array([known.get(row.name, row.value) for row in table.rows])
+        for e, slot in enumerate(table.layout.elements):
+            if slot.name in orders:
+                times = [values[k] for k in old.terms[e].times]
+                out[table.terms[e].times] = (times * slot.terms)[: slot.terms]
+        for k in table.of_kind("delay"):
+            out[k] *= share
+        yield model.coordinates(out)

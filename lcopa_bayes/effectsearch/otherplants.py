@@ -1,0 +1,42 @@
+"""A plant that a loop does not end with and that follows the records as well: its part in gains, delays and
+figures of the step responses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.openeffects import mixture, step_figures
+from lcopa_bayes.effectsearch.scores import State
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class OtherPlant:
+    """Another plant than the chosen one, with its effects and under its noise."""
+
+    state: State
+    gained: float
+    """Log likelihood over that of the chosen one [nat]."""
+
+    @cached_property
+    def draws(self) -> Matrix:
+        """Normal draws about its optimum inside the support, (draws, coordinates)."""
+        return mixture(self.state, None, ())[0][0]
+
+    def figures(self, *, span: float, time_unit: str) -> dict[str, Vector]:
+        """Those of its response to a unit step over `span` [time unit], by name."""
+        found = step_figures(self.state, [self.draws], np.ones(1), span=span, time_unit=time_unit)
+        return {one.name: one.values for one in found}
+
+    def number(self, name: str) -> Vector | None:
+        """A coordinate at the draws; None of one that it does not have."""
+        model = self.state.model
+        if name not in model.names:
+            return None
+        k = model.names.index(name)
+        return model.posterior.table.rows[model.columns[k]].value_at(self.draws[:, k])

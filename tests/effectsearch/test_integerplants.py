@@ -1,0 +1,131 @@
+"""Integer orders beside the plant of a loop: taken where the records let them be, element by element, with
+the odds of a fit of the stated orders, and refused where a fractional order shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from math import log
+
+import numpy as np
+import pytest
+
+from lcopa_bayes.bench.inversion import unit_step
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
+from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
+from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.model.path import TransferPath
+
+RINGING = TransferPath.of_times(1.0, 0.4, (2.0, 1.6), (2.0, 1.0))
+"""Second order, damping 0.4."""
+HALF = TransferPath.of_times(0.8, 0.3, (1.5,), (0.5,))
+NOISE = 0.004
+_SAMPLES, _SPAN = 250, 30.0
+
+
+def record(name: str, paths: tuple[TransferPath, ...], seed: int) -> Record:
+    """Each drive steps up and half down again at times of its own, after a rest."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, _SPAN, _SAMPLES)
+    drive, response = np.zeros((_SAMPLES, len(paths))), 0.02 + NOISE * rng.standard_normal(_SAMPLES)
+    for j, path in enumerate(paths):
+        changes = time[[40 + 45 * j, 150 + 30 * j]]
+        for at, size in zip(changes, (1.0, -0.5), strict=True):
+            drive[time >= at, j] += size
+            since = time - at - path.delay
+            response += size * path.gain * np.where(since > 0, unit_step(path, np.maximum(since, 1e-9)), 0.0)
+    drives = tuple(Axis(f"u{j + 1}", "V") for j in range(len(paths)))
+    return Record(name, time, drive, response[:, None], drives, (Axis("y", "V"),), "s")
+
+
+@cache
+def based(paths: tuple[TransferPath, ...], terms: int | tuple[int, ...]) -> Base:
+    """The base fit of two records with so many terms, of each element where several are given."""
+    fit = tuple(record(f"run{k}", paths, 5 + k) for k in range(2))
+    own = terms if isinstance(terms, int) else {f"y_u{j + 1}": n for j, n in enumerate(terms)}
+    model = ModelSettings(terms=own, share="none", delay="path")
+    study = Study("orders", None, "s", 3, fit, (), model)
+    return fitted_base(study, (), as_stated=True, draws=100)
+
+
+def found(paths: tuple[TransferPath, ...], terms: int | tuple[int, ...]) -> IntegerPlant | None:
+    base = based(paths, terms)
+    return integer_plant(base.start, base.problem)
+
+
+@pytest.mark.parametrize("terms", [1, 2])
+def test_a_second_order_plant_has_integer_orders(terms: int) -> None:
+    """Whatever the number of fractional terms, with the numbers of the plant that made the records."""
+    integer = found((RINGING,), terms)
+    assert integer is not None
+    assert integer.orders == {"": (2.0, 1.0)}
+    assert integer.weight == 0.5
+    state = integer.plant.state
+    model, optimum = state.model, state.optimum
+    truth = {"gain": 1.0, "delay": 0.4, "time_1": log(2.0), "time_2": log(1.6)}
+    for name, value in truth.items():
+        k = model.names.index(name)
+        assert abs(optimum.x[k] - value) < 4 * optimum.sd[k], name
+        assert optimum.sd[k] < 0.1
+    assert not any(name.startswith("order") for name in model.names)
+
+
+def test_its_interval_holds_a_delay_that_free_orders_put_elsewhere() -> None:
+    """Half of the draws of a delay and no draws of a time are those of the plant with integer orders."""
+    base = based((RINGING,), 2)
+    integer = integer_plant(base.start, base.problem)
+    assert integer is not None
+    drawn = integer.plant.number("delay")
+    assert drawn is not None
+    assert abs(np.mean(drawn) - 0.4) < 4 * np.std(drawn)
+    assert np.std(drawn) < base.start.optimum.sd[base.start.model.names.index("delay")]
+    assert integer.plant.number("order_1") is None
+
+
+def test_a_fractional_order_that_shows_is_not_an_integer() -> None:
+    assert found((HALF,), 1) is None
+
+
+def test_elements_are_held_apart() -> None:
+    """One of a second order beside one of order 0.5: only the first is held."""
+    integer = found((RINGING, HALF), (2, 1))
+    assert integer is not None
+    assert integer.orders == {"y_u1": (2.0, 1.0)}
+    assert any(name == "order_1_y_u2" for name in integer.plant.state.model.names)
+
+
+def test_its_odds_are_those_of_a_fit_with_stated_orders() -> None:
+    """By least squares of a study that states them, from its own starts, under the same noise."""
+    base = based((RINGING,), 2)
+    integer = integer_plant(base.start, base.problem)
+    assert integer is not None
+    study = base.problem.study
+    stated = replace(study, model=replace(study.model, terms=2, orders=(2.0, 1.0)))
+    whitening = base.start.whitening
+    other = fitted_base(stated, (), as_stated=True, draws=100).start
+    optimum = Regression(other.model, whitening).descend(other.optimum.x)
+    squares = [float(at.white @ at.white) for at in (base.start.optimum, optimum)]
+    gained = (squares[0] - squares[1]) / 2
+    assert integer.plant.gained == pytest.approx(gained, abs=0.01)
+    assert integer.log_odds == pytest.approx(gained + log(whitening.effective), abs=0.01)
+
+
+def test_weights_follow_the_odds() -> None:
+    """At most half, and a quarter where the odds are one to three."""
+    base = based((RINGING,), 2)
+    integer = integer_plant(base.start, base.problem)
+    assert integer is not None
+    weight = partial(replace, integer)
+    assert weight(log_odds=50.0).weight == 0.5
+    assert weight(log_odds=-log(3.0)).weight == pytest.approx(0.25)
+    assert "25 % of the plant's draws" in weight(log_odds=-log(3.0)).sentence
+
+
+def test_three_terms_stay_as_they_are() -> None:
+    base = based((RINGING,), 2)
+    study = base.problem.study
+    richer = fitted_base(replace(study, model=replace(study.model, terms=3)), (), as_stated=True, draws=100)
+    assert integer_plant(richer.start, richer.problem) is None
