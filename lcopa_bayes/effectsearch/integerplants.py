@@ -3,18 +3,19 @@
 Orders 2 and 1 are a corner of the prior: a second-order plant has all of its posterior on one side, orders
 below 2 with a longer delay, and intervals of delay and rise miss it. Whether orders are integers is a
 question of structure like the number of terms: elements whose orders the records let be integers are held
-there, and that plant has a part in gains, delays and figures of the step responses by its evidence, half of
-them at most.
+there, and that plant has a part in gains, delays and figures of the step responses by its evidence. A linear
+effect that such a plant follows as well takes no name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import exp, log
+from math import log
 from typing import final
 
 import numpy as np
+from scipy.special import expit
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
@@ -22,10 +23,13 @@ from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.lags import linear
 from lcopa_bayes.effectsearch.openeffects import LEAST, Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
+from lcopa_bayes.effectsearch.refits import without
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.parameter import Parameter
@@ -51,9 +55,9 @@ class IntegerPlant:
 
     @property
     def weight(self) -> float:
-        """Its part beside the chosen plant [-]: half of it where the records do not speak against it."""
-        odds = exp(min(self.log_odds, 0.0))
-        return odds / (1.0 + odds)
+        """Its part beside the chosen plant [-]: half of it where the records do not speak against it, and
+        more where it is likelier; that it has fewer parameters does not count beyond half."""
+        return float(expit(min(self.log_odds, max(self.plant.gained, 0.0))))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:
         """Figures of the response to a unit step over `span` [time unit], over this plant too."""
@@ -68,16 +72,10 @@ class IntegerPlant:
     @property
     def sentence(self) -> str:
         """What it is and what part it has."""
-        said = listed(
-            [
-                f"{' and '.join(f'{order:g}' for order in orders)}{f' of {name}' if name else ''}"
-                for name, orders in self.orders.items()
-            ]
-        )
         return (
-            f"The records do not reject integer orders ({said}; {self.log_odds:+.1f} nat by BIC): a plant "
-            f"with them has {100 * self.weight:.0f} % of the plant's draws in gains, delays and figures of "
-            "the step responses."
+            f"The records do not reject integer orders ({_listed(self.orders)}; {self.log_odds:+.1f} nat by "
+            f"BIC): a plant with them has {100 * self.weight:.0f} % of the plant's draws in gains, delays "
+            "and figures of the step responses."
         )
 
 
@@ -98,6 +96,43 @@ def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
     found = [every, *apart, _held(state, problem, some) if len(some) > 1 else None]
     best = max((one for one in found if one is not None), key=lambda one: one.log_odds, default=None)
     return best if best is not None and best.log_odds > log(LEAST) else None
+
+
+def integer_dynamics(state: State, problem: Problem) -> str:
+    """In words, that a plant with integer orders and without the effects of a final state follows the records
+    as well, to the noise; empty where it does not, or where an effect is nonlinear or changes with time."""
+    effects = state.model.effects
+    if not effects or not all(map(linear, effects)):
+        return ""
+    model, x = without(state.model, state.optimum.x, [effect.name for effect in effects])
+    try:
+        bare = replace(state, model=model, optimum=Regression(model, state.whitening).descend(x))
+    except ArithmeticError:
+        return ""
+    found = integer_plant(bare, problem)
+    if found is None:
+        return ""
+    own = found.plant.state.optimum
+    square = float(own.white @ own.white)
+    gained = (float(state.optimum.white @ state.optimum.white) - square) / 2
+    if gained + _saved(state, own.x.size) < -MARGIN or square > REACHED**2 * own.white.size:
+        return ""
+    return f"elements of integer orders ({_listed(found.orders)}) follow the records as well"
+
+
+def _saved(state: State, size: int) -> float:
+    """What a plant of so many coordinates gains by the Bayesian information criterion for being smaller than
+    that of a state [nat]."""
+    return 0.5 * (state.optimum.x.size - size) * log(state.whitening.effective)
+
+
+def _listed(orders: Mapping[str, tuple[float, ...]]) -> str:
+    return listed(
+        [
+            f"{' and '.join(f'{order:g}' for order in own)}{f' of {name}' if name else ''}"
+            for name, own in orders.items()
+        ]
+    )
 
 
 def _nearest(table: ParameterTable, values: Vector) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -125,8 +160,7 @@ def _held(state: State, problem: Problem, orders: dict[str, tuple[float, ...]]) 
         return None
     squares = (at.white @ at.white for at in (state.optimum, optimum))
     gained = float(np.subtract(*squares)) / 2
-    fewer = state.optimum.x.size - optimum.x.size
-    odds = gained + 0.5 * fewer * log(state.whitening.effective)
+    odds = gained + _saved(state, optimum.x.size)
     return IntegerPlant(OtherPlant(State(model, optimum, state.whitening), gained), orders, odds)
 
 

@@ -44,11 +44,11 @@ def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
     """Sums of lags beside the plant of a final model and its linear effects, one for each response axis that
     has any."""
     model = state.model
-    linear = [effect.name for effect in model.effects if _linear(effect)]
-    others = [effect.name for effect in model.effects if not _linear(effect)]
-    plant = replace(model.plant, samples=_without(state, [*linear, *others]), noise=WhiteAR1())
+    constant = [effect.name for effect in model.effects if linear(effect)]
+    others = [effect.name for effect in model.effects if not linear(effect)]
+    plant = replace(model.plant, samples=_without(state, [*constant, *others]), noise=WhiteAR1())
     values = model.values(state.optimum.x)[: len(plant.table.rows)]
-    more, acting = sum(len(places(model, name)) for name in linear), _acting(state, linear)
+    more, acting = sum(len(places(model, name)) for name in constant), _acting(state, constant)
     return lags_beside(
         FittedPlant(
             replace(problem, posterior=plant),
@@ -71,7 +71,7 @@ def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[
     """
     effects = state.model.effects
     supported = [one for one in found if one.support != "plant"]
-    if not supported or not all(_linear(effect) for effect in effects):
+    if not supported or not all(linear(effect) for effect in effects):
         return ""
     acting = _acting(state, [effect.name for effect in effects])
     left = all(_at_noise(one, quiet[one.search.axis]) for one in found)
@@ -88,7 +88,7 @@ def _at_noise(one: Alternative, quiet: int) -> bool:
     return bool(min(one.square, best.square) / best.size <= max(REACHED**2, chance))
 
 
-def _linear(effect: Effect) -> bool:
+def linear(effect: Effect) -> bool:
     """Whether an effect is linear and does not change with time, or such dynamics without a name."""
     return effect.card.linear or effect.card.dynamics
 

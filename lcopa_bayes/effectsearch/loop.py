@@ -21,6 +21,7 @@ from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.integerplants import integer_dynamics
 from lcopa_bayes.effectsearch.lags import (
     ess_with_lags,
     figures_with_lags,
@@ -274,6 +275,7 @@ def _looped(
     reached = _side(problem, searched.state)
     lags = lags_of(searched.state, problem) if chosen else ()
     dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
+    dynamics = dynamics or (integer_dynamics(searched.state, problem) if chosen else "")
     findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
     preferred = any(one.support == "lags" for one in lags)
     verdict = decide(replace(findings, lags=dynamics, preferred=preferred))
@@ -313,12 +315,11 @@ def _looped(
             after = drawn
     if sampled is None and state is not after.state:
         after = _side(problem, state)
-    beside_it = PlantsBeside.of(state, problem, wider) if chosen else PlantsBeside()
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, lags, beside_it),
+        *(outliers, contrary, found, lags, PlantsBeside.of(state, problem, wider if chosen else None)),
     )
 
 

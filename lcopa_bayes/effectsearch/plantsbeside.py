@@ -24,8 +24,11 @@ class PlantsBeside:
     integer: IntegerPlant | None = None
 
     @classmethod
-    def of(cls, state: State, problem: Problem, wider: Sequence[State]) -> Self:
-        """Those beside a final state: of a base fit's `wider` states, and with integer orders."""
+    def of(cls, state: State, problem: Problem, wider: Sequence[State] | None) -> Self:
+        """Those beside a final state: of a base fit's `wider` states, and with integer orders; none of a
+        plant whose structure is stated, where `wider` is None."""
+        if wider is None:
+            return cls()
         return cls(RicherPlants.beside(state, wider), integer_plant(state, problem))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:

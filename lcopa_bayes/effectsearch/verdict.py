@@ -135,7 +135,7 @@ class Findings:
     nothing: float = 1.0
     """Probability that nothing more is missing, by the last residual [-]."""
     lags: str = ""
-    """In words, that sums of lags are all that is missing; empty where they are not."""
+    """In words, that sums of lags, or integer orders, are all that is missing; empty where they are not."""
     preferred: bool = False
     """Whether the records prefer sums of lags to the plant on a response axis."""
 
@@ -179,7 +179,7 @@ def _refused(given: Findings) -> str:
     if given.lags:
         return (
             f"Unmodelled linear dynamics are missing: {given.lags} as any effect, and leave no more than the "
-            "noise. No name is forced; figures of the step responses are over the sums of lags."
+            "noise. No name is forced; figures of the step responses are over them."
         )
     if given.dynamics and not given.effects:
         return (
