@@ -22,8 +22,8 @@ _WIDTH = 1.6
 """Standard deviation of the points a surrogate is fitted to, over that of the optimum's covariance [-]."""
 _PER_TERM = 2.0
 """Such points per term of the quadratic [-]."""
-_PORTION = 16
-"""Points that one process simulates at once [-]."""
+_PORTION = 32
+"""Points that one process simulates at once [-]: half as many take a third longer each."""
 _TRIES = 40
 """Draws for each point inside the prior, at most [-]."""
 

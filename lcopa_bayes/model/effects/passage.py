@@ -362,7 +362,9 @@ class _Forced:
         bend = (last - before) / self.step**2
         rate = last / self.step + 0.5 * self.step * bend
         motion = Motion(level[rows] + y, rate, bend)
-        return self.acting(rows, self.f[rows][:, blocks], motion) - level[rows]
+        # whole rows would be copied for a few of their blocks
+        f = self.f[rows, blocks] if isinstance(blocks, slice) else self.f[rows[:, None], blocks]
+        return self.acting(rows, f, motion) - level[rows]
 
 
 def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:
