@@ -15,13 +15,19 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
-from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
+from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_dynamics, integer_plant
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.effects.response import EvenCurvature
+from lcopa_bayes.model.effects.sensor import SensorLag
 from lcopa_bayes.model.path import TransferPath
 
 RINGING = TransferPath.of_times(1.0, 0.4, (2.0, 1.6), (2.0, 1.0))
 """Second order, damping 0.4."""
 HALF = TransferPath.of_times(0.8, 0.3, (1.5,), (0.5,))
+SLOW = TransferPath(0.8, 0.3, (0.8 * 1.5**0.5, 0.8, 1.5**0.5), (1.5, 1.0, 0.5), 1.0)
+"""One term of order 0.5 and 1.5 s behind a lag of 0.8 s."""
 NOISE = 0.004
 _SAMPLES, _SPAN = 250, 30.0
 
@@ -132,3 +138,33 @@ def test_three_terms_stay_as_they_are() -> None:
     study = base.problem.study
     richer = fitted_base(replace(study, model=replace(study.model, terms=3)), (), as_stated=True, draws=100)
     assert integer_plant(richer.start, richer.problem) is None
+
+
+def with_effect(base: Base, effect: Effect, psi: float) -> State:
+    """A base fit's plant with one effect, descended to its optimum."""
+    start = base.start
+    model = start.model.having(effect)
+    x = np.append(start.optimum.x, psi)
+    return State(model, Regression(model, start.whitening).descend(x), start.whitening)
+
+
+def test_a_lag_that_imitates_a_second_order_takes_no_name() -> None:
+    """One fractional term behind a sensor lag follows a plant that rings; so do orders 2 and 1 without it."""
+    base = based((RINGING,), 1)
+    state = with_effect(base, SensorLag(), 0.5)
+    assert state.optimum.cost < base.start.optimum.cost - 50.0  # the lag would be named
+    assert "2 and 1" in integer_dynamics(state, base.problem)
+
+
+def test_a_lag_behind_a_fractional_plant_keeps_its_name() -> None:
+    """No integer orders follow it."""
+    base = based((SLOW,), 1)
+    state = with_effect(base, SensorLag(), 0.5)
+    assert integer_dynamics(state, base.problem) == ""
+
+
+def test_nonlinear_effects_keep_their_names() -> None:
+    """Integer orders stand in for linear dynamics alone."""
+    base = based((RINGING,), 1)
+    assert integer_dynamics(with_effect(base, EvenCurvature(), 0.01), base.problem) == ""
+    assert integer_dynamics(base.start, base.problem) == ""
