@@ -113,9 +113,9 @@ def integer_dynamics(state: State, problem: Problem) -> str:
     if found is None:
         return ""
     own = found.plant.state.optimum
-    square = float(own.white @ own.white)
-    gained = (float(state.optimum.white @ state.optimum.white) - square) / 2
-    if gained + _saved(state, own.x.size) < -MARGIN or square > REACHED**2 * own.white.size:
+    gained = OtherPlant.beside(state, found.plant.state.model, own).gained
+    left = float(own.white @ own.white) / own.white.size
+    if gained + _saved(state, own.x.size) < -MARGIN or left > REACHED**2:
         return ""
     return f"elements of integer orders ({_listed(found.orders)}) follow the records as well"
 
@@ -136,9 +136,11 @@ def _listed(orders: Mapping[str, tuple[float, ...]]) -> str:
 
 
 def _nearest(table: ParameterTable, values: Vector) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Integer orders of each element of one or two free orders, by its name."""
+    """Integer orders of each element of one or two free orders, by its name; an order whose prior is stated
+    stays as that says."""
     for slot, (_, own) in zip(table.layout.elements, table.terms, strict=True):
-        if slot.terms <= len(_SECOND) and all(table.rows[k].free for k in own):
+        rows = [table.rows[k] for k in own]
+        if slot.terms <= len(_SECOND) and all(row.free and row.default for row in rows):
             yield slot.name, _FIRST if slot.terms == 1 and values[own[0]] <= 1.0 else _SECOND
 
 
@@ -158,10 +160,8 @@ def _held(state: State, problem: Problem, orders: dict[str, tuple[float, ...]]) 
         optimum = Regression(model, state.whitening).best(begin)
     except (ArithmeticError, InputError):
         return None
-    squares = (at.white @ at.white for at in (state.optimum, optimum))
-    gained = float(np.subtract(*squares)) / 2
-    odds = gained + _saved(state, optimum.x.size)
-    return IntegerPlant(OtherPlant(State(model, optimum, state.whitening), gained), orders, odds)
+    plant = OtherPlant.beside(state, model, optimum)
+    return IntegerPlant(plant, orders, plant.gained + _saved(state, optimum.x.size))
 
 
 def _with_orders(study: Study, table: ParameterTable, orders: dict[str, tuple[float, ...]]) -> Study:

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import Self, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.openeffects import mixture, step_figures
+from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.scores import State
 
 
@@ -22,6 +24,12 @@ class OtherPlant:
     state: State
     gained: float
     """Log likelihood over that of the chosen one [nat]."""
+
+    @classmethod
+    def beside(cls, chosen: State, model: ExtendedModel, optimum: Optimum) -> Self:
+        """At its optimum, beside the chosen plant at its own."""
+        squares = (at.white @ at.white for at in (chosen.optimum, optimum))
+        return cls(State(model, optimum, chosen.whitening), float(np.subtract(*squares)) / 2)
 
     @cached_property
     def draws(self) -> Matrix:

@@ -44,8 +44,7 @@ class RicherPlants:
                 optimum = Regression(model, state.whitening).descend(x)
             except ArithmeticError:
                 continue
-            misfits = (at.white @ at.white for at in (state.optimum, optimum))
-            out.append(OtherPlant(State(model, optimum, state.whitening), float(np.subtract(*misfits)) / 2))
+            out.append(OtherPlant.beside(state, model, optimum))
         return cls(tuple(out))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:

@@ -12,7 +12,7 @@ import pytest
 
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_dynamics, integer_plant
@@ -168,3 +168,11 @@ def test_nonlinear_effects_keep_their_names() -> None:
     base = based((RINGING,), 1)
     assert integer_dynamics(with_effect(base, EvenCurvature(), 0.01), base.problem) == ""
     assert integer_dynamics(base.start, base.problem) == ""
+
+
+def test_an_order_with_a_stated_prior_stays() -> None:
+    """Its support may hold no integer."""
+    base = based((RINGING,), 2)
+    own = PriorSettings("order_1", dist="uniform", parameters={"loc": 1.2, "scale": 0.7})
+    stated = fitted_base(replace(base.problem.study, priors={"order_1": own}), (), as_stated=True, draws=100)
+    assert integer_plant(stated.start, stated.problem) is None
