@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import truncnorm
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
+from lcopa_bayes.effectsearch.drawsabout import normal_draws
 from lcopa_bayes.effectsearch.refits import log_bayes_factor, loosened, places, without
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.rounds import Round
@@ -106,7 +106,7 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
-        own = _about(state, rng)
+        own = normal_draws(state, rng, _DRAWS)
         own = own[within(own)]
     parts, weights = [own], [1.0]
     for one in found:
@@ -116,25 +116,6 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
             parts.append(drawn[inside])
             weights.append(one.weight * float(inside.mean()))
     return parts, np.array(weights) / sum(weights)
-
-
-def _about(state: State, rng: np.random.Generator) -> Matrix:
-    """Normal draws about an optimum.
-
-    Coordinates that an end of their support holds are drawn on its inner side, each by itself, with the slope
-    of the likelihood there: of normal draws of several of them at once none may be inside.
-    """
-    optimum, whole = state.optimum, state.covariance
-    stuck, shift = optimum.stuck, np.zeros((_DRAWS, optimum.x.size))
-    slope, sd = (optimum.jacobian.T @ optimum.white)[stuck], np.sqrt(np.diag(whole))[stuck]
-    steep = np.abs(slope) * sd
-    inward = truncnorm(steep, np.inf, -steep * sd, sd).rvs((_DRAWS, steep.size), random_state=rng)
-    shift[:, stuck] = -np.sign(slope) * inward
-    onto = whole[np.ix_(~stuck, stuck)] @ np.linalg.pinv(whole[np.ix_(stuck, stuck)])
-    given = whole[np.ix_(~stuck, ~stuck)] - onto @ whole[np.ix_(stuck, ~stuck)]
-    scatter = rng.standard_normal((_DRAWS, len(given))) @ root_of(given).T
-    shift[:, ~stuck] = scatter + shift[:, stuck] @ onto.T
-    return np.concatenate([optimum.x[None], optimum.x + shift])
 
 
 def pooled(values: Sequence[Vector], weights: Vector) -> Vector:

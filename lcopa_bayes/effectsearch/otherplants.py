@@ -10,10 +10,15 @@ from typing import Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.drawsabout import likely_draws
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.openeffects import mixture, step_figures
+from lcopa_bayes.effectsearch.openeffects import step_figures
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.scores import State
+
+_DRAWS = 120
+"""Draws whose likelihood is computed [-]."""
+_SEED = 29
 
 
 @final
@@ -33,8 +38,8 @@ class OtherPlant:
 
     @cached_property
     def draws(self) -> Matrix:
-        """Normal draws about its optimum inside the support, (draws, coordinates)."""
-        return mixture(self.state, None, ())[0][0]
+        """Draws about its optimum that follow the records, (draws, coordinates)."""
+        return likely_draws(self.state, np.random.default_rng(_SEED), _DRAWS)
 
     def figures(self, *, span: float, time_unit: str) -> dict[str, Vector]:
         """Those of its response to a unit step over `span` [time unit], by name."""
