@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lcopa_bayes import plot as plot
     from lcopa_bayes.core.errors import InputError as InputError
+    from lcopa_bayes.core.parallel import on_cluster as on_cluster
     from lcopa_bayes.data.drive import Drive as Drive
     from lcopa_bayes.data.record import Record as Record
     from lcopa_bayes.data.record import load_record as load_record
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "core.errors": ("InputError",),
+    "core.parallel": ("on_cluster",),
     "data.drive": ("Drive",),
     "data.record": ("Record", "load_record"),
     "data.study": ("Study",),

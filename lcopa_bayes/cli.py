@@ -126,12 +126,17 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
 
         if not (options.quiet or options.json):
             print(f"{options.verb}: loading", file=sys.stderr, flush=True)
-        if _jobs(options) > 1:
+        if options.jobs != 1:
             imported_ahead(_module(options.verb), "lcopa_bayes.report.pages")
     from lcopa_bayes.core.files import trusting
+    from lcopa_bayes.core.parallel import on_cluster
     from lcopa_bayes.results.runfolder import commanded
 
-    with commanded(command), trusting(options.trust):
+    with (
+        commanded(command),
+        trusting(options.trust),
+        on_cluster(getattr(options, "dask", None)) as options.processes,
+    ):
         return VERBS[options.verb](options)
 
 
@@ -213,10 +218,11 @@ def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
 
 
 def _jobs(options: argparse.Namespace) -> int:
-    """Processes to use: as asked for, but no more than there are processors."""
+    """Processes to use: as asked for, but no more than there are processors; with a cluster what that is
+    worth."""
     from lcopa_bayes.core.parallel import cores
 
-    return min(options.jobs or cores(), cores())
+    return options.processes if options.dask else min(options.jobs or cores(), cores())
 
 
 def _on_study(
@@ -280,7 +286,7 @@ def _explain(options: argparse.Namespace) -> Outcome:
 
 
 def _fleet(options: argparse.Namespace) -> Outcome:
-    jobs, keys = _jobs(options), (*_SAMPLING, "dask")
+    jobs, keys = _jobs(options), _SAMPLING
     folder = options.out or RUNS / options.folder.resolve().name
     doing = {"verb": options.of, "folder": folder, "jobs": jobs}
     return _reported(lcopa_bayes.fleet(options.folder, **doing, **_given(options, *keys)), folder, jobs)
@@ -369,7 +375,7 @@ VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
     "loop": _on_study("loop", "quick", "as_stated"),
     "calibrate": _on_study(
         "calibrate",
-        *(*_SAMPLING, "replicas", "around", "engine", "dask"),
+        *(*_SAMPLING, "replicas", "around", "engine"),
         inside="calibration",
         anew=True,
         truth=_truth,

@@ -17,7 +17,7 @@ from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, R
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.files import writable_folder, write_text
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import on_cluster, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import whole, word_of
 from lcopa_bayes.data.study import Study
@@ -149,7 +149,7 @@ def calibrate(
     plan = plan_of(problem, quick=quick)
     plan = replace(plan, target_ess=min(plan.target_ess, ENOUGH))
     replication = Replication(problem, plan, truths, engine)
-    with workers(replication, jobs=min(jobs, replicas), dask=dask) as crew:
+    with on_cluster(dask) as many, workers(replication, jobs=many if dask else min(jobs, replicas)) as crew:
         store = Store.within(folder, replication) if folder is not None else None
         done = store.load(replicas) if store and resume else {}
         if store and not resume:

@@ -172,7 +172,7 @@ def compare(
     """
     problems = _problems(candidates)
     refuse_if(problems)
-    place = None if folder is None else writable_folder(folder) / "candidates"
+    place = None if folder is None else writable_folder(folder).resolve() / "candidates"
     tasks = []
     for one in candidates:
         own = None if place is None else writable_folder(place / folder_name(one.name))

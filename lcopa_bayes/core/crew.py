@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property, lru_cache, partial
+from threading import get_ident
 from time import monotonic
 from types import SimpleNamespace, TracebackType
 from typing import Any, TypeVar, final
@@ -43,13 +44,11 @@ class Crew:
         is done in this one.
         """
         common = lru_cache(1)(lambda: packed(shared))
+        work = lru_cache(1)(lambda task: partial(_done, task, common()))  # one task, however many inputs
 
         def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
-            if not self._ended and self.jobs > 1 and monotonic() >= self._due:
-                sent = common()
-                if sent is not None:
-                    work = partial(_done, task, sent)
-                    return SimpleNamespace(result=partial(next, self._pool.map(work, [one])))
+            if not self._ended and self.jobs > 1 and monotonic() >= self._due and common() is not None:
+                return SimpleNamespace(result=partial(next, self._pool.each(work(task), [one])))
             return SimpleNamespace(result=partial(task, shared, one))
 
         return Workers(submit, iter)
@@ -69,13 +68,15 @@ class Crew:
 
 
 @lru_cache(1)
-def _unpacked(sent: bytes) -> Any:
+def _unpacked(sent: bytes, thread: int) -> Any:
+    """What was packed; a thread has its own, with what that caches."""
     return unpacked(sent)
 
 
-def _done(task: Callable[[Any, T], R], sent: bytes, one: T) -> R:
+def _done(task: Callable[[Any, T], R], sent: bytes | None, _: None, one: T) -> R:
     """A task in a worker, which keeps what tasks share for the next one."""
-    return task(_unpacked(sent), one)
+    assert sent is not None
+    return task(_unpacked(sent, get_ident()), one)
 
 
 ALONE = Crew()

@@ -5,16 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import pickle
-import platform
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
-from importlib import import_module
-from importlib.metadata import version
 from itertools import chain
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
@@ -23,6 +21,7 @@ from typing import Any, Generic, TypeVar, final
 
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.core.cluster import ADVICE, Cluster, connected
 from lcopa_bayes.core.errors import InputError
 
 S = TypeVar("S")
@@ -31,12 +30,9 @@ R = TypeVar("R")
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
 """Options of the allocator of the GNU C library with their values: arrays below 32 MB, the most it takes,
 come from the heap, and up to 256 MB at its end are kept when they are freed [byte]."""
-CONNECT = 5.0
-"""Time a Dask scheduler has to answer [s]."""
 _SCRIPT = b"__main__"
 """Where the main script keeps what it defines, which no worker imports."""
-_ALIKE = "install the same versions on every worker"
-_ADVICE = "what was finished is stored; go on with --resume"
+_CLUSTER: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
 
 @final
@@ -100,33 +96,56 @@ class _Tasks:
 
 
 @contextmanager
-def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Workers[S]]:
-    """Workers that share a value: `jobs` processes of one thread each, this one alone where `jobs` is 1, or
-    those of the Dask cluster at the address `dask`. What no other process can read, such as an effect of a
-    study's own file, is done by this one.
+def on_cluster(address: str | None) -> Iterator[int]:
+    """Within it what several processes would do is done on the Dask cluster at an address; how many processes
+    that is worth, at least 2. Nothing, and 1, without an address.
+
+    InputError when there is no such cluster, and when the cluster, or a task with its worker, is lost.
+    """
+    if address is None:
+        yield 1
+        return
+    with connected(address) as cluster:
+        token = _CLUSTER.set(cluster)
+        try:
+            yield max(2, cluster.size)
+        finally:
+            _CLUSTER.reset(token)
+
+
+@contextmanager
+def workers(shared: S, *, jobs: int = 1, here: bool = False) -> Iterator[Workers[S]]:
+    """Workers that share a value: `jobs` processes of one thread each, or those of the cluster inside of
+    `on_cluster`, unless the tasks have to be done `here`, on this machine; this process alone where `jobs` is
+    1. What no other process can read, such as an effect of a study's own file, is done by this one.
 
     Processes end with this one, however it ends, and do not run the main script again, so that a script needs
-    no main guard. InputError when there is no such cluster, and when a worker or the cluster is lost.
+    no main guard. InputError when a worker is lost.
     """
     keep_freed_memory()
-    if dask is not None:
-        with _cluster(shared, dask) as cluster:
-            yield cluster
-    elif jobs <= 1:
-        with threadpool_limits(1):
+    cluster = None if here else _CLUSTER.get()
+    with threadpool_limits(1):  # threads here would take the workers' cores
+        if jobs <= 1:
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
-    else:
+            return
         sent, tasks = packed(shared), _Tasks()
-        with _pool(jobs, sent) as pool, threadpool_limits(1):  # threads here would take the workers' cores
 
-            def submit(task: Callable[[S, T], R], one: T) -> Any:
-                number, work = tasks.sent(task)
-                given = None if sent is None or work is None else packed(one)
-                if work is None or given is None:
-                    return _Later(task, shared, one)
+        def submit(give: Callable[[int, bytes, bytes], Any], task: Callable[[S, T], R], one: T) -> Any:
+            number, work = tasks.sent(task)
+            given = None if sent is None or work is None else packed(one)
+            if work is None or given is None:
+                return _Later(task, shared, one)
+            return give(number, work, given)
+
+        if cluster is not None:
+            yield Workers(partial(submit, cluster.giving(sent)), partial(_as_finished, cluster.as_finished))
+            return
+        with _pool(jobs, sent) as pool:
+
+            def give(number: int, work: bytes, given: bytes) -> Any:
                 return pool.submit(_perform, number, work, given)
 
-            yield Workers(submit, _as_finished)
+            yield Workers(partial(submit, give), partial(_as_finished, as_completed))
 
 
 @contextmanager
@@ -158,7 +177,7 @@ def _pool(jobs: int, shared: bytes | None) -> Iterator[ProcessPoolExecutor]:
     except BrokenProcessPool:
         raise InputError(
             f"a worker process ended, perhaps for want of memory, or because it was given what the main "
-            f"script itself defines, which belongs in a module; {_ADVICE}"
+            f"script itself defines, which belongs in a module; {ADVICE}"
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
@@ -178,10 +197,10 @@ def unpacked(sent: bytes) -> Any:
     return pickle.loads(sent)
 
 
-def _as_finished(futures: Iterable[Any]) -> Iterator[Any]:
+def _as_finished(theirs: Callable[[Sequence[Any]], Iterator[Any]], futures: Iterable[Any]) -> Iterator[Any]:
     """Tasks of this process while workers do theirs, then these as they finish."""
     own = [one for one in futures if isinstance(one, _Later)]
-    return chain(own, as_completed(one for one in futures if not isinstance(one, _Later)))
+    return chain(own, theirs([one for one in futures if not isinstance(one, _Later)]))
 
 
 def keep_freed_memory() -> None:
@@ -205,89 +224,9 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-@contextmanager
-def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
-    try:
-        distributed = import_module("distributed")
-    except ImportError:
-        raise InputError("--dask needs the package distributed: pip install 'lcopa-bayes[dask]'") from None
-    try:
-        with ThreadPoolExecutor(1) as beside:  # a notebook has a loop of its own here
-            beside.submit(_ask, distributed, address).result()
-        client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
-    except Exception as error:  # whatever another service than a scheduler answers leads to
-        raise InputError(
-            f"--dask {address}: no Dask scheduler answers there ({str(error) or 'it says nothing'}); "
-            "start one with `dask scheduler`, and give the address it prints, such as tcp://host:8786"
-        ) from None
-    try:
-        with client:
-            _refuse_unlike(client, address)
-            # sent once; a worker that needs it takes it from another
-            held = client.submit(_same, shared, pure=False)
-            yield Workers(
-                lambda task, one: client.submit(_on_cluster, task, held, one, pure=False),
-                partial(distributed.as_completed, loop=client.loop),
-            )
-    except distributed.client.FutureCancelledError as error:
-        raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
-
-
-def _ask(distributed: Any, address: str) -> None:
-    """Wait for the answer of a scheduler, for which a client would wait without end."""
-    import asyncio  # loaded where a cluster is used
-
-    async def identity() -> None:
-        keys = distributed.Security().get_connection_args("client")
-        scheduler = distributed.rpc(address, timeout=CONNECT, connection_args=keys)
-        async with asyncio.timeout(CONNECT + 1), scheduler:
-            await scheduler.identity(n_workers=0)
-
-    asyncio.run(identity())
-
-
-def _refuse_unlike(client: Any, address: str) -> None:
-    """InputError where a cluster has no worker, or one whose versions would give other numbers or none."""
-    try:
-        client.wait_for_workers(1, timeout=CONNECT)
-    except TimeoutError:
-        raise InputError(
-            f"--dask {address}: the cluster has no worker; start some with `dask worker {address}`"
-        ) from None
-    own = _versions()
-    for worker, theirs in client.run(_versions, on_error="return").items():
-        if isinstance(theirs, Exception):
-            raise InputError(f"--dask {address}: the worker {worker} cannot take part ({theirs}); {_ALIKE}")
-        unlike = [
-            f"{name} {theirs.get(name)}, here {known}"
-            for name, known in own.items()
-            if theirs.get(name) != known
-        ]
-        if unlike:
-            raise InputError(f"--dask {address}: the worker {worker} has {'; '.join(unlike)}; {_ALIKE}")
-
-
-def _versions() -> dict[str, str]:
-    """Versions on which numbers and what is sent depend."""
-    major, minor, *_ = platform.python_version_tuple()
-    packages = ("lcopa-bayes", "numpy", "scipy", "distributed")
-    return {"Python": f"{major}.{minor}"} | {name: version(name) for name in packages}
-
-
-def _on_cluster(task: Callable[[S, T], R], shared: S, one: T) -> R:
-    """A task on a worker of a cluster. It gives no work to the cluster itself, so that xarray takes no lock
-    of the scheduler for a file in memory, which that has no name for."""
-    with import_module("dask").config.set(scheduler="synchronous"):
-        return task(shared, one)
-
-
 def _alone(function: Callable[[T], R], shared: object, one: T) -> R:
     """A function of the input alone as a task."""
     return function(one)
-
-
-def _same(shared: S) -> S:
-    return shared
 
 
 @contextmanager

@@ -66,7 +66,7 @@ class Result(ABC):
             return self._write_page(folder, jobs)
 
     def _write_page(self, folder: Path, jobs: int) -> Path:
-        with workers(None, jobs=min(jobs, 2)) as crew:
+        with workers(None, jobs=min(jobs, 2), here=True) as crew:
             return next(crew.map(write_page, [(self.verb, folder)]))
 
     def is_in(self, folder: Path) -> bool:
@@ -104,7 +104,7 @@ def write_page(wanted: tuple[str, Path]) -> Path:
 def write_fit_page(folder: Path, fresh: Fresh | None, *, jobs: int) -> Path:
     """Write the page of a fit into its run folder, also before its values and draws are there where these are
     given, the halves of its figures at the same time where `jobs` allow it; returns its path."""
-    with workers((folder, fresh), jobs=min(jobs, 2)) as crew:
+    with workers((folder, fresh), jobs=min(jobs, 2), here=True) as crew:
         halves = list(crew.each(_drawn_half, (0, 1)))
         return next(crew.each(_composed, [halves]))
 

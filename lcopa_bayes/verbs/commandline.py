@@ -124,6 +124,7 @@ _ENDS: Mapping[str, Any] = {"nargs": 2, "metavar": ("LOW", "HIGH"), "default": N
 _COLUMN = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
 _QUICK = _flag("--quick", "a quarter of the steps or replicas: to see that it runs")
 _JOBS = _option("--jobs", "processes, at most one per core (default: all cores)", type=_whole(1))
+_DASK = _option("--dask", "scheduler of a Dask cluster that does the work in their place", metavar="ADDRESS")
 _OVERWRITE = _flag("--overwrite", "replace files that are there")
 
 
@@ -139,7 +140,7 @@ def _about(out: str = "runs/<study>") -> tuple[Option, ...]:
 
 def _parallel(out: str = "runs/<study>") -> tuple[Option, ...]:
     """Options of verbs about a study that use several processes."""
-    return (*_about(out), _JOBS)
+    return (*_about(out), _JOBS, _DASK)
 
 
 def _sampled(out: str = "runs/<study>") -> tuple[Option, ...]:
@@ -254,7 +255,6 @@ USAGES: Mapping[str, Usage] = {
                 "importance",
                 "sampling",
             ),
-            _option("--dask", "scheduler of a Dask cluster that does the replicas", metavar="ADDRESS"),
         ),
     ),
     "fleet": Usage(
@@ -265,7 +265,7 @@ USAGES: Mapping[str, Usage] = {
             _choice("--verb", "what is done with every device", "fit", "audit", "loop", "compare", dest="of"),
             _path("--out", "run folder (default: runs/<folder>); devices finished there are kept"),
             _JOBS,
-            _option("--dask", "scheduler of a Dask cluster that does the devices", metavar="ADDRESS"),
+            _DASK,
             _flag("--resume", "go on within devices that were interrupted"),
             _QUICK,
         ),

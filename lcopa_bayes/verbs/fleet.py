@@ -21,7 +21,7 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import csv_of, read_json, save_json, writable_folder, write_text, write_whole
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import on_cluster, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import word_of
 from lcopa_bayes.data.study import Study
@@ -216,7 +216,8 @@ def fleet(
         missing = [one for one in members if stored[one[1].name] is None]
         grades = Counter(one["row"]["grade"] for one in outcomes)
         with (
-            workers(work, jobs=min(jobs, max(1, len(missing))), dask=dask) as crew,
+            on_cluster(dask) as many,
+            workers(work, jobs=many if dask else min(jobs, max(1, len(missing)))) as crew,
             Progress(
                 total=len(outcomes) + len(missing),
                 initial=len(outcomes),

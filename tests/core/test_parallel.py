@@ -4,16 +4,11 @@ import os
 import platform
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread, Timer
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -218,92 +213,6 @@ def wait_for(condition, most: float = 30.0) -> None:
     while not condition():
         assert time.monotonic() < until, "it takes too long"
         time.sleep(0.05)
-
-
-@contextmanager
-def cluster(count: int) -> Iterator[Any]:
-    """A Dask cluster of processes."""
-    distributed = pytest.importorskip("distributed")
-    options = {"threads_per_worker": 1, "dashboard_address": ":0", "memory_limit": 0}
-    with distributed.LocalCluster(n_workers=count, **options) as made:
-        yield made
-
-
-@contextmanager
-def service(answer: bytes) -> Iterator[str]:
-    """The address of something that is no scheduler and answers this to whoever calls."""
-    held = []
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve() -> None:
-            while True:
-                try:
-                    held.append(server.accept()[0])
-                except OSError:
-                    return
-                held[-1].sendall(answer)
-
-        Thread(target=serve, daemon=True).start()
-        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        server.shutdown(socket.SHUT_RDWR)
-        for one in held:
-            one.close()
-
-
-def slowly(shared, one):
-    time.sleep(0.4)
-    return shared * one
-
-
-@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 8])
-def test_an_address_where_no_scheduler_is_is_said_within_seconds(answer):
-    pytest.importorskip("distributed")
-    began = time.monotonic()
-    with (
-        service(answer) as address,
-        pytest.raises(InputError, match=f"--dask {address}: no Dask scheduler answers there") as caught,
-        workers(1, dask=address),
-    ):
-        pass
-    assert len(caught.value.problems) == 1
-    assert time.monotonic() - began < 15.0
-
-
-def test_a_cluster_without_workers_is_said():
-    with (
-        cluster(0) as made,
-        pytest.raises(InputError, match="the cluster has no worker; start some with `dask worker tcp:"),
-        workers(1, dask=made.scheduler_address),
-    ):
-        pass
-
-
-def test_a_worker_that_is_killed_changes_no_result():
-    with cluster(2) as made, workers(3, dask=made.scheduler_address) as crew:
-        pid = next(iter(made.workers.values())).pid
-        Timer(0.6, os.kill, (pid, signal.SIGKILL)).start()
-        assert list(crew.each(slowly, range(8))) == [3 * one for one in range(8)]
-        assert pid not in [one.pid for one in made.workers.values()]
-
-
-def test_workers_of_other_versions_are_refused(monkeypatch):
-    here = os.getpid()
-
-    def unlike() -> dict[str, str]:
-        if os.getpid() != here:
-            raise ModuleNotFoundError("No module named 'lcopa_bayes'")
-        return {}
-
-    known = parallel.version
-    with cluster(1) as made:
-        monkeypatch.setattr(parallel, "version", lambda name: "0.1" if name == "scipy" else known(name))
-        refused = rf"the worker tcp:\S+ has scipy {known('scipy')}, here 0.1; install the same versions"
-        with pytest.raises(InputError, match=refused), workers(1, dask=made.scheduler_address):
-            pass
-        monkeypatch.setattr(parallel, "_versions", unlike)
-        refused = r"cannot take part \(No module named 'lcopa_bayes'\); install the same versions"
-        with pytest.raises(InputError, match=refused), workers(1, dask=made.scheduler_address):
-            pass
 
 
 @pytest.mark.parametrize("where", ["shared", "input"])
