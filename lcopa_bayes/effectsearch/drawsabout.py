@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import chi2, truncnorm
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
@@ -25,8 +25,9 @@ _NEARER = (1.0, 0.5, 0.25)
 """Shares of its distance from the optimum at which a draw is tried [-]."""
 _NEAR, _WANTED = 2.0, 0.5
 """Rise of the cost at which a scale is read off, at most, and at one standard deviation of a normal [nat]."""
-_SHORTER, _SHORTEST = 0.05, 1e-4
-"""Factor by which a step along an axis is shortened at most, and share of the normal scale that ends it."""
+_SHORTER, _SHORTEST, _LONGER = 0.05, 1e-4, 1e6
+"""Factors by which a step along an axis is shortened at most, shares of the normal scale that end it, and
+factor over a step at which a cost has not risen."""
 
 
 def normal_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
@@ -45,38 +46,35 @@ def normal_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
 def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     """Of `count` draws, those inside the support that follow the records, the optimum first, (draws,
     coordinates); their likelihood is computed, and that of some steps along each principal axis."""
-    x, stuck, (low, high) = state.optimum.x, state.optimum.stuck, state.model.bounds
+    x, (low, high) = state.optimum.x, state.model.bounds
     regression = Regression(state.model, state.whitening)
 
-    def rise(there: Vector) -> float:
-        inside = ((there >= low) & (there <= high)).all()
-        return regression.cost(there) - state.optimum.cost if inside else np.inf
+    def rises(many: Matrix) -> Vector:
+        out, inside = np.full(len(many), np.inf), ((many >= low) & (many <= high)).all(axis=1)
+        out[inside] = regression.costs(many[inside]) - state.optimum.cost
+        return out
 
     shift, given = _held(state, rng, count)
-    free = np.flatnonzero(~stuck)
+    free = np.flatnonzero(~state.optimum.stuck)
     spread = state.model.spread[free]
     power, axes = np.linalg.eigh(given / np.outer(spread, spread))
-    sd, axes = np.sqrt(np.maximum(power, 0.0)), axes * spread[:, None]
-
-    def along(axis: Vector) -> Callable[[float], float]:
-        def at(step: float) -> float:
-            there = x.copy()
-            there[free] += step * axis
-            return rise(there)
-
-        return at
-
-    scales = np.array(
-        [[_scale(along(side * axis), one) for side in (-1, 1)] for axis, one in zip(axes.T, sd, strict=True)]
-    ).reshape(-1, 2)
+    sd = np.repeat(np.sqrt(np.maximum(power, 0.0)), 2)
+    sides = np.zeros((2 * free.size, x.size))
+    sides[:, free] = np.repeat((axes * spread[:, None]).T, 2, axis=0)
+    sides[::2] *= -1.0
+    scales = _scales(lambda step, which: rises(x + step[:, None] * sides[which]), sd).reshape(-1, 2)
     z = rng.standard_normal((count, free.size))
-    shift[:, free] += (np.where(z < 0, scales[:, 0], scales[:, 1]) * z) @ axes.T
+    shift += (
+        np.abs(z * scales[:, 0]) * (z < 0) @ sides[::2] + np.abs(z * scales[:, 1]) * (z >= 0) @ sides[1::2]
+    )
     limit = float(chi2.isf(_CHANCE, x.size)) / 2
-    kept = [x]
-    for one in shift:
-        near = next((x + share * one for share in _NEARER if rise(x + share * one) <= limit), None)
-        kept += [] if near is None else [near]
-    return np.array(kept)
+    kept, left = np.full((count, x.size), np.nan), np.arange(count)
+    for share in _NEARER:
+        near = x + share * shift[left]
+        follow = rises(near) <= limit
+        kept[left[follow]] = near[follow]
+        left = left[~follow]
+    return np.concatenate([x[None], np.delete(kept, left, axis=0)])
 
 
 def _held(state: State, rng: np.random.Generator, count: int) -> tuple[Matrix, Matrix]:
@@ -94,16 +92,19 @@ def _held(state: State, rng: np.random.Generator, count: int) -> tuple[Matrix, M
     return shift, np.asarray(whole[np.ix_(~stuck, ~stuck)] - onto @ whole[np.ix_(stuck, ~stuck)])
 
 
-def _scale(rise: Callable[[float], float], sd: float) -> float:
-    """Standard deviation to one side of an axis: of the normal whose log density falls as the `rise` of the
-    cost with the step, not more than `sd`."""
-    step = most = sd
-    while step > _SHORTEST * sd:
-        risen = rise(step)
-        if risen <= _NEAR:
-            return min(most, step * np.sqrt(_WANTED / risen)) if risen > 0 else most
-        if np.isinf(risen):  # beyond the support, where no normal ends
-            most = step = step / 2
-        else:
-            step *= max(_SHORTER, np.sqrt(_WANTED / risen))
-    return step
+def _scales(rises: Callable[[Vector, Index], Vector], sd: Vector) -> Vector:
+    """Standard deviations to the sides of axes, (sides,), each of the normal whose log density falls as the
+    cost `rises` with the step, and not more than `sd`; `rises` takes steps and the sides they go to."""
+    step, most, out = sd.copy(), sd.copy(), np.full(sd.size, np.nan)
+    left = np.flatnonzero(sd > 0)
+    out[sd <= 0] = 0.0
+    while left.size:
+        risen = rises(step[left], left)
+        here, beyond = step[left], np.isinf(risen)  # beyond the support, where no normal ends
+        read = (risen <= _NEAR) | (here <= _SHORTEST * sd[left])
+        ratio = np.sqrt(_WANTED / np.maximum(risen, 1e-300))
+        out[left[read]] = np.minimum(most[left], here * np.minimum(ratio, _LONGER))[read]
+        step[left] = np.where(beyond, here / 2, here * np.maximum(_SHORTER, np.minimum(ratio, 1.0)))
+        most[left[beyond]] = step[left[beyond]]
+        left = left[~read]
+    return out

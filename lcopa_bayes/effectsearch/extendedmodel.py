@@ -15,7 +15,7 @@ from lcopa_bayes.inference.declared import with_effects
 from lcopa_bayes.inference.effects import Effected, Placed, effected
 from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.posterior import Posterior, bounded
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 
 _MERGED = 1e-6
@@ -210,6 +210,22 @@ class ExtendedModel:
     def predict(self, x: Vector) -> Vector:
         """Stacked responses, (n,) [response unit]; UnstableError where there are none."""
         return np.asarray(self.observed + self._least.misfit(x, self.template)[: self.plant.size])
+
+    def predictions(self, many: Matrix) -> Matrix:
+        """Stacked responses at coordinates (batch, k), (batch, n) [response unit]; infinite where there are
+        none."""
+        posterior = self.posterior
+        values = posterior.table.canonical(np.array([self._least.values(x, self.template) for x in many]))
+        units = posterior.responses(values)
+        parts = [
+            observed.values - posterior.residual(axis, r, observed, values, units[r])
+            for r, record in enumerate(posterior.samples)
+            for axis, observed in enumerate(record.axes)
+        ]
+        out = np.concatenate(parts, axis=1)
+        if posterior.simulation is not None:
+            out[~bounded(units)] = np.inf
+        return out
 
     def tangents(self, x: Vector) -> tuple[Vector, Matrix]:
         """Stacked responses, (n,), and their derivatives in the coordinates, (n, k)."""

@@ -3,6 +3,7 @@ it is not."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.drawsabout import _scale, likely_draws, normal_draws
+from lcopa_bayes.effectsearch.drawsabout import _scales, likely_draws, normal_draws
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.model.path import TransferPath
@@ -76,19 +77,31 @@ def test_the_optimum_is_first() -> None:
 
 @pytest.mark.parametrize("wanted", [1.0, 0.3, 0.01])
 def test_a_scale_is_that_of_the_normal_that_falls_as_steeply(wanted: float) -> None:
-    """To its own side of the optimum."""
-
-    def rise(step: float) -> float:
-        return 0.5 * (step / wanted) ** 2
-
-    assert _scale(rise, 1.0) == pytest.approx(wanted, rel=1e-12)
+    """To each side of an axis by itself."""
+    widths = np.array([wanted, 0.5])
+    scales = _scales(lambda step, which: 0.5 * (step / widths[which]) ** 2, np.ones(2))
+    np.testing.assert_allclose(scales, widths, rtol=1e-12)
 
 
-def test_a_scale_is_never_wider_than_the_normal_one() -> None:
-    assert _scale(lambda step: 0.1 * step**2, 1.0) == 1.0
-    assert _scale(lambda step: -step, 1.0) == 1.0
+@pytest.mark.parametrize("falls", [lambda step: 0.1 * step**2, lambda step: -step, np.zeros_like])
+def test_a_scale_is_never_wider_than_the_normal_one(falls: Callable[[np.ndarray], np.ndarray]) -> None:
+    np.testing.assert_array_equal(_scales(lambda step, _: falls(step), np.array([1.0, 0.2])), [1.0, 0.2])
 
 
 def test_a_scale_ends_inside_the_support() -> None:
-    assert _scale(lambda step: np.inf if step > 0.03 else 0.5 * step**2, 1.0) <= 0.03
-    assert _scale(lambda step: np.inf if step > 0.03 else 0.0, 1.0) > 0.01
+    (scale,) = _scales(lambda step, _: np.where(step > 0.03, np.inf, 0.5 * step**2), np.ones(1))
+    assert 0.01 < scale <= 0.03
+
+
+def test_an_axis_without_width_has_none() -> None:
+    np.testing.assert_array_equal(_scales(lambda step, _: step**2, np.zeros(2)), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("terms", [1, 3])
+def test_costs_of_several_are_those_of_each(terms: int) -> None:
+    state = at_optimum(terms)
+    regression = Regression(state.model, state.whitening)
+    drawn = likely_draws(state, np.random.default_rng(2), 40)
+    each = [regression.cost(x) for x in drawn]
+    np.testing.assert_allclose(regression.costs(drawn), each, rtol=1e-9)
+    assert regression.costs(drawn[:0]).shape == (0,)
