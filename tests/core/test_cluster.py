@@ -213,7 +213,9 @@ def divided(shared, one):
     return one / shared
 
 
-@pytest.mark.parametrize("verb", ["fit", "audit", "compare", "loop"])
+@pytest.mark.parametrize(
+    "verb", ["fit", "compare", *(pytest.param(verb, marks=pytest.mark.slow) for verb in ("audit", "loop"))]
+)
 def test_a_verb_gives_the_same_numbers_there(made, verb, monkeypatch):
     """And its tasks are done there: none of a process of this machine."""
     study = lb.Study("there", fit=[stepped(1), stepped(2)], held_out=[stepped(3)], model={"terms": 1})
