@@ -222,7 +222,7 @@ def _jobs(options: argparse.Namespace) -> int:
     worth."""
     from lcopa_bayes.core.parallel import cores
 
-    return options.processes if options.dask else min(options.jobs or cores(), cores())
+    return options.processes if getattr(options, "dask", None) else min(options.jobs or cores(), cores())
 
 
 def _on_study(

@@ -885,7 +885,7 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
     ],
 )
 def test_bad_input_is_reported_and_nothing_is_written(written, tmp_path, capsys, monkeypatch, words, said):
-    monkeypatch.setattr("lcopa_bayes.core.parallel.CONNECT", 0.5)
+    monkeypatch.setattr("lcopa_bayes.core.cluster.CONNECT", 0.5)
     out = tmp_path / "run"
     code, printed, reported = run(capsys, "calibrate", written, *words, "--out", out, "--quiet")
     assert code == 2
