@@ -7,7 +7,6 @@ along.
 
 from __future__ import annotations
 
-import pickle
 import platform
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +21,7 @@ from typing import Any, final
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.packing import unpacked
 
 CONNECT = 5.0
 """Time a Dask scheduler has to answer [s]."""
@@ -146,13 +146,13 @@ def _perform(work: bytes, shared: bytes | None, given: bytes) -> Any:
     own = get_ident()
     with import_module("dask").config.set(scheduler="synchronous"), threadpool_limits(1):
         common = None if shared is None else _unpacked(shared, own)
-        return _unpacked(work, own)(common, pickle.loads(given))
+        return _unpacked(work, own)(common, unpacked(given))
 
 
 @lru_cache(_UNPACKED)
 def _unpacked(sent: bytes, thread: int) -> Any:
     """What was packed; each thread has its own, with what that caches."""
-    return pickle.loads(sent)
+    return unpacked(sent)
 
 
 def _same(sent: bytes) -> bytes:

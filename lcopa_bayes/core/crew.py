@@ -10,7 +10,8 @@ from time import monotonic
 from types import SimpleNamespace, TracebackType
 from typing import Any, TypeVar, final
 
-from lcopa_bayes.core.parallel import Workers, imported_ahead, packed, unpacked, workers
+from lcopa_bayes.core.packing import packed, unpacked
+from lcopa_bayes.core.parallel import Workers, imported_ahead, workers
 
 S = TypeVar("S")
 T = TypeVar("T")

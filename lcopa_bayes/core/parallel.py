@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import pickle
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,6 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.cluster import ADVICE, Cluster, connected
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.packing import packed, unpacked
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -30,8 +30,6 @@ R = TypeVar("R")
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
 """Options of the allocator of the GNU C library with their values: arrays below 32 MB, the most it takes,
 come from the heap, and up to 256 MB at its end are kept when they are freed [byte]."""
-_SCRIPT = b"__main__"
-"""Where the main script keeps what it defines, which no worker imports."""
 _CLUSTER: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
 
@@ -89,7 +87,7 @@ class _Tasks:
     _sent: tuple[int, bytes | None] = (0, None)
 
     def sent(self, task: object) -> tuple[int, bytes | None]:
-        """Number of a task, by which a worker knows the one it did last, and its pickle, as `packed`."""
+        """Number of a task, by which a worker knows the one it did last, and its bytes, as `packed`."""
         if task is not self._task:
             self._task, self._sent = task, (self._sent[0] + 1, packed(task))
         return self._sent
@@ -181,20 +179,6 @@ def _pool(jobs: int, shared: bytes | None) -> Iterator[ProcessPoolExecutor]:
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def packed(value: object) -> bytes | None:
-    """A pickle; None where another process could not read it."""
-    try:
-        out = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return None
-    return None if _SCRIPT in out else out
-
-
-def unpacked(sent: bytes) -> Any:
-    """What `packed` was given, in a process of its own; nothing else is read so."""
-    return pickle.loads(sent)
 
 
 def _as_finished(theirs: Callable[[Sequence[Any]], Iterator[Any]], futures: Iterable[Any]) -> Iterator[Any]:
