@@ -16,7 +16,7 @@ from scipy.stats import chi2, truncnorm
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
-from lcopa_bayes.effectsearch.regression import Optimum, Regression
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 
 _CHANCE = 1e-3
@@ -59,14 +59,12 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     spread = state.model.spread[free]
     power, axes = np.linalg.eigh(given / np.outer(spread, spread))
     sd = np.repeat(np.sqrt(np.maximum(power, 0.0)), 2)
-    sides = np.zeros((2 * free.size, x.size))
-    sides[:, free] = np.repeat((axes * spread[:, None]).T, 2, axis=0)
-    sides[::2] *= -1.0
+    onto = np.zeros((free.size, x.size))
+    onto[:, free] = (axes * spread[:, None]).T
+    sides = np.stack([-onto, onto], axis=1).reshape(-1, x.size)
     scales = _scales(lambda step, which: rises(x + step[:, None] * sides[which]), sd).reshape(-1, 2)
     z = rng.standard_normal((count, free.size))
-    shift += (
-        np.abs(z * scales[:, 0]) * (z < 0) @ sides[::2] + np.abs(z * scales[:, 1]) * (z >= 0) @ sides[1::2]
-    )
+    shift += (np.where(z < 0, scales[:, 0], scales[:, 1]) * z) @ onto
     limit = float(chi2.isf(_CHANCE, x.size)) / 2
     kept, left = np.full((count, x.size), np.nan), np.arange(count)
     for share in _NEARER:
@@ -80,8 +78,7 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
 def _held(state: State, rng: np.random.Generator, count: int) -> tuple[Matrix, Matrix]:
     """Shifts of the coordinates that an end of their support holds, and of the others by these, (count,
     coordinates); and the covariance of the others given them."""
-    optimum: Optimum = state.optimum
-    whole, stuck = state.covariance, optimum.stuck
+    optimum, whole, stuck = state.optimum, state.covariance, state.optimum.stuck
     shift = np.zeros((count, optimum.x.size))
     slope, sd = (optimum.jacobian.T @ optimum.white)[stuck], np.sqrt(np.diag(whole))[stuck]
     steep = np.abs(slope) * sd

@@ -155,7 +155,7 @@ def test_it_is_worth_two_processes_at_least():
 
 
 @pytest.mark.parametrize("where", ["shared", "task"])
-def test_what_tasks_share_is_sent_and_unpacked_once(made, where):
+def test_what_tasks_share_is_unpacked_once(made, where):
     values = np.arange(100_000.0)
     with on_cluster(made.scheduler_address) as jobs:
         shared, task = (values, total) if where == "shared" else (None, partial(of_itself, values))
