@@ -12,16 +12,14 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
-from threading import get_ident
 from typing import Any, final
 
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.packing import unpacked
+from lcopa_bayes.core.packing import Latest, unpacked
 
 CONNECT = 5.0
 """Time a Dask scheduler has to answer [s]."""
@@ -29,8 +27,8 @@ ADVICE = "what was finished is stored; go on with --resume"
 _ALIKE = "install the same versions on every worker"
 _LARGE = 1 << 14
 """Size from which a task is held by the cluster and not sent with each of its inputs [byte]."""
-_UNPACKED = 32
-"""Tasks and shared values that a worker process keeps for its threads, the latest ones [-]."""
+_unpacked = Latest(2)
+"""Keeps a task and what it shares, in a worker."""
 
 
 @final
@@ -143,16 +141,9 @@ def _versions() -> dict[str, str]:
 def _perform(work: bytes, shared: bytes | None, given: bytes) -> Any:
     """A task on a worker. It gives no work to the cluster itself, so that xarray takes no lock of the
     scheduler for a file in memory, which that has no name for."""
-    own = get_ident()
     with import_module("dask").config.set(scheduler="synchronous"), threadpool_limits(1):
-        common = None if shared is None else _unpacked(shared, own)
-        return _unpacked(work, own)(common, unpacked(given))
-
-
-@lru_cache(_UNPACKED)
-def _unpacked(sent: bytes, thread: int) -> Any:
-    """What was packed; each thread has its own, with what that caches."""
-    return unpacked(sent)
+        common = None if shared is None else _unpacked(shared)
+        return _unpacked(work)(common, unpacked(given))
 
 
 def _same(sent: bytes) -> bytes:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property, lru_cache, partial
-from threading import get_ident
 from time import monotonic
 from types import SimpleNamespace, TracebackType
 from typing import Any, TypeVar, final
 
-from lcopa_bayes.core.packing import packed, unpacked
+from lcopa_bayes.core.packing import Latest, packed
 from lcopa_bayes.core.parallel import Workers, imported_ahead, workers
 
 S = TypeVar("S")
@@ -68,16 +67,14 @@ class Crew:
         self._stack.close()
 
 
-@lru_cache(1)
-def _unpacked(sent: bytes, thread: int) -> Any:
-    """What was packed; a thread has its own, with what that caches."""
-    return unpacked(sent)
+_unpacked = Latest(1)
+"""Keeps what the tasks of a stage share, in a worker."""
 
 
 def _done(task: Callable[[Any, T], R], sent: bytes | None, _: None, one: T) -> R:
     """A task in a worker, which keeps what tasks share for the next one."""
     assert sent is not None
-    return task(_unpacked(sent, get_ident()), one)
+    return task(_unpacked(sent), one)
 
 
 ALONE = Crew()

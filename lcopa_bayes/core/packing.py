@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from typing import Any
+from functools import lru_cache
+from threading import local
+from typing import Any, final
 
 _SCRIPT = b"__main__"
 """Where the main script keeps what it defines, which no worker imports."""
@@ -21,3 +23,17 @@ def packed(value: object) -> bytes | None:
 def unpacked(sent: bytes) -> Any:
     """What `packed` was given, in a process of its own; nothing else is read so."""
     return pickle.loads(sent)
+
+
+@final
+class Latest(local):
+    """Unpacks what several tasks need once, for each thread its own, with what that caches; keeps as many as
+    stated, the latest."""
+
+    def __init__(self, count: int) -> None:
+        """None is kept yet; every thread begins so."""
+        self.kept = lru_cache(count)(unpacked)
+
+    def __call__(self, sent: bytes) -> Any:
+        """What `packed` was given."""
+        return self.kept(sent)

@@ -124,7 +124,7 @@ def lost(shared, one):
 
 def total(shared, one):
     """Of something large and the input, with how often a worker has unpacked the former."""
-    return float(shared.sum()) + one, module._unpacked.cache_info().misses
+    return float(shared.sum()) + one, module._unpacked.kept.cache_info().misses
 
 
 def of_itself(values, shared, one):
