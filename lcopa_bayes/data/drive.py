@@ -55,7 +55,7 @@ class AxisDrive:
         """With every change later by a time [time unit], one or (changes,); they may change places."""
         return AxisDrive.of_jumps(self.times + by, self.jumps)
 
-    @property
+    @cached_property
     def jumps(self) -> Vector:
         """Change of the drive at each instant [drive unit], (changes,)."""
         return np.diff(self.values, prepend=0.0)

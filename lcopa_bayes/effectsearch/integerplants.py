@@ -70,13 +70,9 @@ class IntegerPlant:
         return number if values is None else number.beside([values], self.weight)
 
     @property
-    def sentence(self) -> str:
-        """What it is and what part it has."""
-        return (
-            f"The records do not reject integer orders ({_listed(self.orders)}; {self.log_odds:+.1f} nat by "
-            f"BIC): a plant with them has {100 * self.weight:.0f} % of the plant's draws in gains, delays "
-            "and figures of the step responses."
-        )
+    def said(self) -> str:
+        """What it is."""
+        return f"integer orders ({_listed(self.orders)}; {self.log_odds:+.1f} nat by BIC)"
 
 
 def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self, final
 
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
 from lcopa_bayes.effectsearch.openeffects import Weighed
-from lcopa_bayes.effectsearch.richerplants import RicherPlants
+from lcopa_bayes.effectsearch.richerplants import WEIGHT, RicherPlants
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
@@ -42,3 +43,27 @@ class PlantsBeside:
         if self.integer is not None:
             number = self.integer.number(number, row)
         return self.richer.number(number, row)
+
+    @property
+    def shares(self) -> tuple[tuple[str, float], ...]:
+        """Each plant in words, and its share of the draws of all [-]; the chosen one first."""
+        richer = self.richer.said
+        left = 1 - WEIGHT if richer else 1.0
+        integer = 0.0 if self.integer is None else left * self.integer.weight
+        beside = [] if self.integer is None else [(f"a plant with {self.integer.said}", integer)]
+        beside += [(f"a plant of {said}", WEIGHT / len(richer)) for said in richer]
+        return ("the plant chosen", left - integer), *beside
+
+    @property
+    def sentence(self) -> str:
+        """What they are and what part they have; empty without any."""
+        shares = self.shares
+        if len(shares) == 1:
+            return ""
+        said = listed(
+            [f"{100 * share:.0f} % {'are ' * (not k)}of {one}" for k, (one, share) in enumerate(shares)]
+        )
+        return (
+            "Gains, delays and figures of the step responses are over plants that the records do not reject. "
+            f"Of their draws {said}."
+        )

@@ -72,18 +72,9 @@ class RicherPlants:
         return number.beside([values for values in theirs if values is not None], WEIGHT)
 
     @property
-    def sentence(self) -> str:
-        """What they are and what part they have; empty without any."""
-        if not self.plants:
-            return ""
-        several = len(self.plants) > 1
-        said = " or ".join(map(_said, self.plants))
-        little = "which have" if several else "which has"
-        part = "they have equal parts" if several else "it has a part"
-        return (
-            f"The records do not reject {said}, {little} too little evidence to be chosen: {part} in gains, "
-            f"delays and figures of the step responses, {100 * WEIGHT:.0f} % of the plant's draws."
-        )
+    def said(self) -> tuple[str, ...]:
+        """What each is."""
+        return tuple(map(_said, self.plants))
 
 
 def _least_order(model: ExtendedModel, x: Vector) -> float:
@@ -92,11 +83,10 @@ def _least_order(model: ExtendedModel, x: Vector) -> float:
 
 
 def _said(one: OtherPlant) -> str:
-    """What it is."""
     elements = one.state.model.plant.table.layout.elements
     terms, count = max(element.terms for element in elements), len(elements)
     own = f"{count} elements" if count > 1 else "one element"
     return (
-        f"a plant of {own} with {terms} {'terms' if terms > 1 else 'term'} (log likelihood higher by "
-        f"{max(one.gained, 0.0):.1f})"
+        f"{own} with {terms} {'terms' if terms > 1 else 'term'} (log likelihood higher by "
+        f"{max(one.gained, 0.0):.1f} nat)"
     )

@@ -54,8 +54,7 @@ def results(result: Loop) -> dict[str, Any]:
         "alternatives": {
             "sums_of_lags": [one.as_json() for one in result.lags],
             "sentence": sentence_of(result.lags),
-            "richer": result.plants.richer.sentence,
-            "integer_orders": result.plants.integer.sentence if result.plants.integer else "",
+            "plants": result.plants.sentence,
         },
         "outliers": result.outliers
         and attributes(result.outliers, "count", "share", "width", "log_bayes_factor", "sentence"),

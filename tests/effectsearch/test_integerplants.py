@@ -16,6 +16,7 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_dynamics, integer_plant
+from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.model.effects.effect import Effect
@@ -130,7 +131,13 @@ def test_weights_follow_the_odds() -> None:
     assert weight(log_odds=50.0, plant=replace(integer.plant, gained=log(4.0))).weight == pytest.approx(0.8)
     assert weight(log_odds=5000.0, plant=replace(integer.plant, gained=4000.0)).weight == 1.0
     assert weight(log_odds=-log(3.0)).weight == pytest.approx(0.25)
-    assert "25 % of the plant's draws" in weight(log_odds=-log(3.0)).sentence
+    beside = PlantsBeside(integer=weight(log_odds=-log(3.0)))
+    assert [share for _, share in beside.shares] == pytest.approx([0.75, 0.25])
+    assert (
+        "Of their draws 75 % are of the plant chosen, 25 % of a plant with integer orders (2 and 1"
+        in beside.sentence
+    )
+    assert not PlantsBeside().sentence
 
 
 def test_three_terms_stay_as_they_are() -> None:

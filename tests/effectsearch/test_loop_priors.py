@@ -118,7 +118,7 @@ def drifting(seed: int, period: float) -> Study:
     return Study("drifting", None, "s", seed, (record,), model=ModelSettings(terms=1))
 
 
-@pytest.mark.parametrize("period", [0.5, 1.0])
+@pytest.mark.parametrize("period", [pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_a_drift_far_beyond_its_prior_is_named_and_nothing_else(period, monkeypatch):
     """Neither another start of the plant nor effects of the device. With one width of the prior the search
     sees no drift in the finer samples; the coarser ones leave a residual too smooth to be judged without."""

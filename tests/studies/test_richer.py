@@ -71,6 +71,12 @@ def test_its_part_is_the_stated_weight(found: Loop) -> None:
         assert len(number.parts) == parts + len(found.open)
         assert number.weights.sum() == pytest.approx(1.0)
         assert parts == 1 or number.weights[-1] == pytest.approx(richerplants.WEIGHT)
+    shares = [share for _, share in alone.plants.shares]
+    assert alone.number(names.index("gain")).weights[-1] == pytest.approx(shares[-1])
+    assert sum(shares) == pytest.approx(1.0)
+    assert (
+        f"{100 * richerplants.WEIGHT:.0f} % of a plant of one element with 3 terms" in alone.plants.sentence
+    )
     steady = next(one for one in alone.figures if one.name == "steady_state[y1]")
     own = steady.parts[-1]
     gain = alone.number(names.index("gain")).parts[-1]

@@ -18,10 +18,12 @@ from lcopa_bayes.data.studywriter import write_study
 PLAIN = {"model": {"terms": 1}, "noise": {"kind": "white"}, "sampler": {"target_ess": 40}}
 """Settings with which a verb takes seconds."""
 SEARCHED = {
-    "one record, hours": Shape(samples=30, records=1, unit="s", second=9_000.0, settings=PLAIN),
+    "one record, hours, eight bits": Shape(
+        samples=30, records=1, unit="s", second=9_000.0, step=1 / 128, settings=PLAIN
+    ),
     "1x2, dark record": Shape(samples=30, drives=2, dark=True, settings=PLAIN),
     "2x1, missing cells": Shape(samples=30, responses=2, missing=0.3, settings=PLAIN),
-    "2x2, eight bits": Shape(samples=30, responses=2, drives=2, step=1 / 128, settings=PLAIN),
+    "2x2": Shape(samples=30, responses=2, drives=2, settings=PLAIN),
     "no sample at rest": Shape(samples=30, early=True, records=3, jitter=0.5, settings=PLAIN),
     "microseconds": Shape(samples=30, unit="s", second=2e-6, records=3, drift=0.1, settings=PLAIN),
 }
@@ -103,7 +105,9 @@ def test_every_verb_answers(tmp_path, capsys):
     assert (tmp_path / "loop" / "explained.toml").exists()
 
 
-@pytest.mark.parametrize("name", SEARCHED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "2x2")) for name in SEARCHED]
+)
 def test_a_loop_on_any_shape(name, tmp_path, capsys):
     folder = written(SEARCHED[name].study(), tmp_path)
     values = answer(

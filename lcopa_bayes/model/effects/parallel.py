@@ -112,12 +112,12 @@ def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) ->
 
     K is the gain of the path from the axis' own drive, which arrives after its delay.
     """
-    columns = []
+    out = np.zeros((scene.times.size, scene.ranges.axes))
     for axis in range(scene.ranges.axes):
         drive, rest, gain, delay = scene.direct(axis)
-        moved = summed(scene.times, drive, delay, drive.jumps, shape)
-        columns.append(size * gain * (rest + moved))
-    return np.stack(columns, axis=1)
+        if size * gain:  # a likelihood asks for one path after the other
+            out[:, axis] = size * gain * (rest + summed(scene.times, drive, delay, drive.jumps, shape))
+    return out
 
 
 @final
@@ -181,13 +181,13 @@ class Backflow(ParallelEffect):
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """``(x^2 / 2) e^(-x)``, x = t / Tb, per change."""
-        columns = []
+        out = np.zeros((scene.times.size, scene.ranges.axes))
         for axis in range(scene.ranges.axes):
             drive, rest, gain, delay = scene.direct(axis)
-            chosen = np.where(falling(drive, rest) != self.rising, drive.jumps, 0.0)
-            kick = summed(scene.times, drive, delay, chosen, self.kick)
-            columns.append(psi[0] * gain * kick)
-        return np.stack(columns, axis=1)
+            if psi[0] * gain:
+                chosen = np.where(falling(drive, rest) != self.rising, drive.jumps, 0.0)
+                out[:, axis] = psi[0] * gain * summed(scene.times, drive, delay, chosen, self.kick)
+        return out
 
     def kick(self, t: Array) -> Array:
         """Response to a unit change."""
