@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import log
 from typing import final
 
@@ -179,12 +180,13 @@ def _starts(state: State, model: ExtendedModel, orders: Collection[str]) -> Iter
     old, table = state.model.plant.table, model.plant.table
     values = state.model.values(state.optimum.x)
     known = dict(zip(old.names, values, strict=False))
-    for share in _SHORTER:
+    for share, alike in product(_SHORTER, (False, True)):
         out = np.array([known.get(row.name, row.value) for row in table.rows])
         for e, slot in enumerate(table.layout.elements):
             if slot.name in orders:
-                times = [values[k] for k in old.terms[e].times]
-                out[table.terms[e].times] = (times * slot.terms)[: slot.terms]
+                own = old.terms[e]
+                times = values[own.times][:1] if alike else values[own.times]
+                out[table.terms[e].times] = np.resize(times, slot.terms)
         for k in table.of_kind("delay"):
             out[k] *= share
         yield model.coordinates(out)

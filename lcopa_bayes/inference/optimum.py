@@ -15,12 +15,16 @@ from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.pathstarts import beside_each_other
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
 _SCREENED, _FEWER = 1024, 512
 """Prior draws whose misfit is looked at, and of them beside starts that are known."""
+_FURTHER_STARTS = 2
+"""Starts of several paths by draws beside each other, and by poles of a regression however unlikely these are
+[-]: few descents from draws end in a resonance."""
 _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log, or sd of the prior]."""
 _WEIGHTLESS = 30.0
@@ -82,13 +86,22 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return optima_near(posterior, effect_starts(posterior, [one.values for one in alone], rng))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
-    drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
+    poles = regressed(posterior, drawn)
+    drawn = nearly_white(posterior, np.vstack([poles, drawn, *near]))
     each = posterior.log_likelihoods(drawn)
     likelihood = each.sum(axis=0)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
     own = len(drawn) - len(near)
-    begun = _distinct(posterior, _ranked(table, drawn[:own], each[:, :own]), starts)
+    ranked = _ranked(table, drawn[:own], each[:, :own])
+    begun = _distinct(posterior, ranked, starts)
+    if len(table.layout.paths) > 1:
+        likely = np.argsort(-likelihood[: len(poles)], kind="stable")
+        further = [
+            _of_several_paths(posterior, ranked, starts)[:_FURTHER_STARTS],
+            drawn[likely][:_FURTHER_STARTS],
+        ]
+        begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * _FURTHER_STARTS)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
@@ -96,6 +109,12 @@ def find_optima(
     if not further:
         return found
     return _recombined(posterior, _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]))
+
+
+def _of_several_paths(posterior: Posterior, ranked: Matrix, starts: int) -> Matrix:
+    """Starts in which paths have draws of their own, likeliest first."""
+    found = beside_each_other(posterior, ranked, starts)
+    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else found
 
 
 def _ranked(table: ParameterTable, values: Matrix, likelihoods: Matrix) -> Matrix:

@@ -12,7 +12,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.posterior import Posterior
 
-LAGS = 4
+LAGS = (0, 1, 2, 3, 5, 8, 13, 21, 34)
 """Sampling periods of delay tried [-]."""
 _EVEN = 1e-2
 """Gaps this close to one sampling period are one [periods]."""
@@ -21,32 +21,35 @@ _FEWEST = 30
 
 
 def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:
-    """The drawn table values, (draws, rows), with poles and delays from a regression, draw k at lag k.
+    """Drawn table values, (draws, rows), with poles and delays from a regression at one lag each, (at most
+    lags, rows); none where the samples do not give them.
 
-    Only free parameters are set, and only to values of their domain; all other entries stay as drawn.
+    All paths to a response have the same poles. Only free parameters are set, and only to values of their
+    domain; all other entries stay as drawn.
     """
-    table, out = posterior.table, drawn[:LAGS].copy()
-    layout, samples = table.layout, posterior.samples
+    table, samples, out = posterior.table, posterior.samples, list[Vector]()
+    layout = table.layout
     longest = max((one.times for one in samples), key=np.size)
     period = float(np.median(np.diff(longest)))
-    for lag, row in enumerate(out):
-        for i in range(len(layout.responses)):
-            j = min(i, len(layout.drives) - 1)
+    for lag, row in zip(LAGS, drawn, strict=False):
+        wanted = dict[tuple[str, int, int], float]()
+        for i, (elements, delays) in enumerate(zip(layout.element_of, layout.delay_of, strict=True)):
             poles = _poles(samples, i, lag, period)
             if poles is None:
                 continue
-            element = layout.element_of[i][j]
-            wanted = {("delay", layout.delay_of[i][j], 0): max(lag - 0.5, 0.1) * period}
-            for term, (time, order) in enumerate(_terms(poles, layout.elements[element].terms)):
-                wanted["time", element, term], wanted["order", element, term] = time, order
-            for (kind, first, second), value in wanted.items():
-                k = table.at(kind, first, second)
-                low, high = table.rows[k].domain
-                if table.rows[k].free and low <= value <= high:
-                    row[k] = value
-    legal = table.supported(out)
-    out[~legal] = drawn[:LAGS][~legal]
-    return np.asarray(table.canonical(out))
+            wanted |= dict.fromkeys((("delay", d, 0) for d in delays), max(lag - 0.5, 0.1) * period)
+            for element in elements:
+                for term, (time, order) in enumerate(_terms(poles, layout.elements[element].terms)):
+                    wanted["time", element, term], wanted["order", element, term] = time, order
+        own = row.copy()
+        for (kind, first, second), value in wanted.items():
+            k = table.at(kind, first, second)
+            low, high = table.rows[k].domain
+            if table.rows[k].free and low <= value <= high:
+                own[k] = value
+        if wanted and table.supported(own[None])[0]:
+            out.append(own)
+    return np.asarray(table.canonical(np.array(out))) if out else drawn[:0]
 
 
 def _poles(samples: tuple[Samples, ...], axis: int, lag: int, period: float) -> Vector | None:

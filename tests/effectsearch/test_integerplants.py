@@ -92,6 +92,21 @@ def test_its_interval_holds_a_delay_that_free_orders_put_elsewhere() -> None:
     assert integer.plant.number("order_1") is None
 
 
+def test_a_slow_term_of_a_low_order_is_no_start_of_a_lag() -> None:
+    """A plant one of whose paths has three times the gain and puts the rest into a term of order 0.2 and
+    thousands of time units leads to the same plant with integer orders."""
+    base = based((RINGING, RINGING), (2, 2))
+    start = base.start
+    other = {"gain": 3.0, "delay": 0.9, "time_1": 4.6, "order_1": 1.75, "time_2": 1650.0, "order_2": 0.17}
+    values = start.model.values(start.optimum.x)
+    for name, value in other.items():
+        values[start.model.plant.table.names.index(f"{name}_y_u2")] = value
+    optimum = Regression(start.model, start.whitening).at(start.model.coordinates(values))
+    found = [integer_plant(state, base.problem) for state in (replace(start, optimum=optimum), start)]
+    costs = [one.plant.state.optimum.cost for one in found if one is not None]
+    assert costs == pytest.approx([0.5 * start.whitening.size] * 2, rel=0.2)
+
+
 def test_a_fractional_order_that_shows_is_not_an_integer() -> None:
     assert found((HALF,), 1) is None
 
