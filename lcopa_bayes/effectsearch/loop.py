@@ -313,13 +313,13 @@ def _looped(
             cautions, sampled = (*cautions, _ASTRAY), None
         else:
             after = drawn
-    if sampled is None and state is not after.state:
-        after = _side(problem, state)
+    after = _side(problem, state) if sampled is None and state is not after.state else after
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
+    plants = PlantsBeside.of(state, problem, wider if chosen else None)
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, lags, PlantsBeside.of(state, problem, wider if chosen else None)),
+        *(outliers, contrary, found, plants.held_against(lags, state), plants),
     )
 
 

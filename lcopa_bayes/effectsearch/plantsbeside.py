@@ -4,7 +4,7 @@ orders."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self, final
 
 from lcopa_bayes.core.wording import listed
@@ -14,6 +14,7 @@ from lcopa_bayes.effectsearch.richerplants import WEIGHT, RicherPlants
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.results.sumsoflags import Alternative, parameters_of
 
 
 @final
@@ -43,6 +44,22 @@ class PlantsBeside:
         if self.integer is not None:
             number = self.integer.number(number, row)
         return self.richer.number(number, row)
+
+    def held_against(self, lags: Sequence[Alternative], chosen: State) -> tuple[Alternative, ...]:
+        """Sums of lags beside the chosen plant, held against that with integer orders where it follows a
+        response better by Akaike's criterion."""
+        if self.integer is None:
+            return tuple(lags)
+        states, out = (chosen, self.integer.plant.state), []
+        for one in lags:
+            parts = [part.rows for part in chosen.whitening.parts if part.axis == one.search.axis]
+            plant, integer = (
+                sum(float(at.optimum.white[rows] @ at.optimum.white[rows]) for rows in parts)
+                + 2 * parameters_of(at.model.plant.table, one.paths)
+                for at in states
+            )
+            out.append(replace(one, advantage=one.advantage - max(plant - integer, 0.0)))
+        return tuple(out)
 
     @property
     def shares(self) -> tuple[tuple[str, float], ...]:

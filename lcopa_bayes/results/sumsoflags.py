@@ -230,13 +230,13 @@ def _alternative(
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 10 * _STREAM + axis
     searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends, kinds))
-    parameters = _parameters(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
+    parameters = parameters_of(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
     best = searches[0].best
     advantage = square + 2 * parameters - best.square - 2 * best.parameters
     return Alternative(paths, searches, advantage, square, seed)
 
 
-def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
+def parameters_of(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
     """Free parameters of a plant that the paths use [-]."""
     used: set[int] = set()
     for one in paths:

@@ -16,6 +16,7 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_dynamics, integer_plant
+from lcopa_bayes.effectsearch.lags import lags_of
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
@@ -133,6 +134,23 @@ def test_its_odds_are_those_of_a_fit_with_stated_orders() -> None:
     gained = (squares[0] - squares[1]) / 2
     assert integer.plant.gained == pytest.approx(gained, abs=0.01)
     assert integer.log_odds == pytest.approx(gained + log(whitening.effective), abs=0.01)
+
+
+def test_sums_of_lags_are_held_against_it() -> None:
+    """One term of a free order does not ring: sums of lags follow better, and the second-order plant better
+    still. Their criterion is that of a search beside the latter alone."""
+    base = based((RINGING,), 1)
+    start, integer = base.start, integer_plant(base.start, base.problem)
+    assert integer is not None
+    found = lags_of(start, base.problem)
+    assert [one.support for one in found] == ["lags"]
+    held = PlantsBeside(integer=integer).held_against(found, start)
+    direct = lags_of(integer.plant.state, base.problem)
+    assert [one.support for one in held] == [one.support for one in direct] == ["plant"]
+    assert held[0].advantage == pytest.approx(direct[0].advantage, abs=0.1 * abs(direct[0].advantage))
+    swapped = PlantsBeside(integer=replace(integer, plant=replace(integer.plant, state=start)))
+    assert swapped.held_against(found, start)[0].advantage == found[0].advantage
+    assert PlantsBeside().held_against(found, start) == found
 
 
 def test_weights_follow_the_odds() -> None:
