@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.model.effects.effect import DriveEffect
+from lcopa_bayes.model.effects.effect import DriveEffect, ParallelEffect, ReadoutEffect
 from lcopa_bayes.model.effects.passage import Moved, Plant
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import Dynamics
@@ -24,14 +24,21 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     A difference through the simulator itself, of second order with `COEFFICIENT_STEP` prior standard
     deviations, to one side where a one-signed coefficient would turn negative; of first order, exact but
     for what other effects bend, where the effect is `linear`. Coefficients of one record are moved in all
-    records at once: records do not see each other's.
+    records at once: records do not see each other's. What a parallel effect adds to a reading that no other
+    effect bends is the slope itself.
     """
-    records, first = len(simulator.model.experiments), 0
+    effects, records, first = simulator.effects, len(simulator.model.experiments), 0
+    bent = any(isinstance(effect, ReadoutEffect) for effect in effects)
+    adding = {
+        e: effect
+        for e, effect in enumerate(effects)
+        if isinstance(effect, ParallelEffect) and effect.linear and not bent
+    }
     cases, parts = [psi], list[tuple[Index, bool, Vector, slice]]()
-    for effect in simulator.effects:
+    for e, effect in enumerate(effects):
         coefficients = effect.coefficients(simulator.ranges)
         repeats = records if effect.card.per_record else 1
-        for k, coefficient in enumerate(coefficients):
+        for k, coefficient in () if e in adding else enumerate(coefficients):
             columns = first + k + len(coefficients) * np.arange(repeats)
             step = COEFFICIENT_STEP * coefficient.scale
             steps, weights = np.array([step]), np.array([-1.0, 1.0])
@@ -53,6 +60,12 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
         for r, there in enumerate(zip(read[0], *read[place], strict=True)):
             slope = sum(w * y for w, y in zip(weights, there, strict=True))
             out[r][..., columns[r if per_record else 0]] = slope
+    places = np.arange(simulator.size, dtype=float)
+    for e, adds in adding.items():
+        for r, (scene, _) in enumerate(moved_all[0]):
+            own = simulator.part(places, e, r).astype(int)
+            for k, unit in zip(own, np.eye(own.size), strict=True):
+                out[r][..., k] = adds.added(scene, unit)
     return out
 
 
