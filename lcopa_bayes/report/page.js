@@ -1,4 +1,4 @@
-// Tables that sort and copy, figures that enlarge, and sections that open where a link leads.
+// Tables that sort, filter and copy, figures that enlarge, and sections that open where a link leads.
 (() => {
   const number = (text) => {
     const plain = text.trim().replace(/\u2212/g, "-").replace(/\u00d710([\u207b\u2070\u00b9\u00b2\u00b3\u2074-\u2079]+)/,
@@ -12,6 +12,26 @@
     if (label) made.setAttribute("aria-label", label);
     made.addEventListener("click", act);
     return made;
+  };
+  const LONG = 12; // rows from which a table has a filter
+  const filter = (table, body) => {
+    const field = Object.assign(document.createElement("input"), { type: "search", placeholder: "Filter rows" });
+    const count = document.createElement("span");
+    field.setAttribute("aria-label", "Filter the rows of this table: those with all of the words stay");
+    count.setAttribute("role", "status");
+    field.addEventListener("input", () => {
+      const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
+      for (const row of body.rows) {
+        const text = [...row.cells].map((cell) => cell.textContent).join(" ").toLowerCase();
+        row.hidden = !words.every((word) => text.includes(word));
+      }
+      const shown = [...body.rows].filter((row) => !row.hidden).length;
+      count.textContent = words.length ? `${shown} of ${body.rows.length} rows` : "";
+    });
+    const place = document.createElement("div");
+    place.className = "filter";
+    place.append(field, count);
+    table.parentElement.before(place);
   };
   for (const table of document.querySelectorAll("table")) {
     const body = table.tBodies[0];
@@ -32,7 +52,7 @@
       if (body.rows.length > 1) head.replaceChildren(sort);
     });
     const copy = button("Copy", "Copy this table", () => {
-      const rows = [...table.tHead.rows, ...body.rows];
+      const rows = [...table.tHead.rows, ...body.rows].filter((row) => !row.hidden);
       const text = rows.map((row) => [...row.cells].map((cell) => cell.textContent.trim()).join("\t")).join("\n");
       const done = () => { copy.textContent = "Copied"; setTimeout(() => { copy.textContent = "Copy"; }, 1500); };
       if (navigator.clipboard) return navigator.clipboard.writeText(text).then(done);
@@ -44,6 +64,7 @@
     });
     copy.className = "tool";
     table.parentElement.after(copy);
+    if (body.rows.length >= LONG) filter(table, body);
   }
   // On a narrow screen panels side by side stand one below the other, and a legend by itself, as views of the
   // one drawing, and a wide panel is squeezed but for its text and markers: shrunk to the screen as a whole its

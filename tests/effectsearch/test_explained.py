@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.model.effects.commands import OverdrivePulse, RefreshHold
 from lcopa_bayes.model.effects.records import Vibration
+from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import Fit, fit
 
 
@@ -171,14 +173,37 @@ def test_what_is_explained_already_is_refused(bent: Loop):
         loop(bent.study, library=LIBRARY, quick=True)
 
 
-def test_the_command_writes_it(tmp_path: Path):
-    """From the command line: the study it ends with lies beside its results and can be loaded."""
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of the command line."""
+    folder = tmp_path_factory.mktemp("made")
     source = study(2, curvature=0.08, held_out=1)
-    (tmp_path / "in").mkdir()
-    write_study(replace(source, name="made"), tmp_path / "in" / "study.toml")
-    arguments = ["loop", str(tmp_path / "in"), "--out", str(tmp_path / "run"), "--quick", "--jobs", "1"]
+    (folder / "in").mkdir()
+    write_study(replace(source, name="made"), folder / "in" / "study.toml")
+    arguments = ["loop", str(folder / "in"), "--out", str(folder / "run"), "--quick", "--jobs", "1"]
     assert main([*arguments, "--quiet", "--as-stated"]) == 0
-    reported = json.loads((tmp_path / "run" / "loop.json").read_text())
-    made = load_study(tmp_path / "run" / "explained.toml")
+    return folder / "run"
+
+
+def test_the_command_writes_it(run: Path):
+    """From the command line: the study it ends with lies beside its results and can be loaded."""
+    reported = json.loads((run / "loop.json").read_text())
+    made = load_study(run / "explained.toml")
     assert list(made.effects.use) == [one["name"] for one in reported["effects"]]
     assert len(made.held_out) == 1
+
+
+@pytest.mark.parametrize("support", ["plant", "both", "lags"])
+def test_the_page_says_over_which_plants_its_numbers_are(run: Path, tmp_path: Path, support: str):
+    """Gains and delays are over sums of lags too, unless the records do not support these."""
+    folder = Path(shutil.copytree(run, tmp_path / "run"))
+    values = json.loads((folder / "loop.json").read_text())
+    values["alternatives"] |= {
+        "sums_of_lags": [{"support": support}],
+        "sentence": "Sums of lags.",
+        "plants": "Of their draws.",
+    }
+    (folder / "loop.json").write_text(json.dumps(values))
+    page = write_page_of("loop", folder).read_text("utf-8")
+    assert ("Gains and delays above are over the same plants" in page) == (support != "plant")
+    assert page.count("Of their draws.") == 1

@@ -196,6 +196,31 @@ def test_a_table_sorts_by_its_numbers_both_ways(browser, tmp_path):
     page.close()
 
 
+def test_a_long_table_shows_the_rows_with_all_words_typed(browser, tmp_path):
+    assert main(["optics", "--out", str(tmp_path), "--quiet"]) == 0
+    page, errors = opened(browser, tmp_path / "optics.html")
+    long = [
+        k
+        for k in range(page.locator("table").count())
+        if page.locator("table").nth(k).locator("tbody tr").count() >= 12
+    ]
+    assert page.locator(".filter").count() == len(long) > 0
+    table, place = page.locator("table").nth(long[0]), page.locator(".filter").first
+    rows = table.locator("tbody tr")
+    every = [" ".join(row.split("\t")).lower() for row in rows.all_inner_texts()]
+    words = every[3].split()[0], every[3].split()[-1]
+    place.locator("input").fill(f"  {words[0].upper()} {words[1]} ")
+    kept = [row for row in every if all(word in row for word in words)]
+    assert 0 < rows.locator("visible=true").count() == len(kept) < len(every)
+    assert place.locator("[role=status]").inner_text() == f"{len(kept)} of {len(every)} rows"
+    place.locator("input").fill("no such row")
+    assert place.locator("[role=status]").inner_text() == f"0 of {len(every)} rows"
+    place.locator("input").fill("")
+    assert [row.is_visible() for row in rows.all()] == [True] * len(every)
+    assert errors == []
+    page.close()
+
+
 def test_a_zoom_is_shared_and_values_follow_the_cursor(browser, report):
     page, errors = opened(browser, report, viewport={"width": 1300, "height": 2000})
     part = page.locator("details.explore").first
