@@ -23,8 +23,8 @@ from lcopa_bayes.model.effects.effect import UnstableError
 _SCREENED, _FEWER = 1024, 512
 """Prior draws whose misfit is looked at, and of them beside starts that are known."""
 _FURTHER_STARTS = 2
-"""Starts of several paths by draws beside each other, and by poles of a regression however unlikely these are
-[-]: few descents from draws end in a resonance."""
+"""Most starts of several paths by draws beside each other, and by poles of a regression however unlikely
+these are, each half as many as of draws [-]: few descents from draws end in a resonance."""
 _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log, or sd of the prior]."""
 _WEIGHTLESS = 30.0
@@ -96,12 +96,10 @@ def find_optima(
     ranked = _ranked(table, drawn[:own], each[:, :own])
     begun = _distinct(posterior, ranked, starts)
     if len(table.layout.paths) > 1:
+        count = min(_FURTHER_STARTS, max(1, starts // 2))
         likely = np.argsort(-likelihood[: len(poles)], kind="stable")
-        further = [
-            _of_several_paths(posterior, ranked, starts)[:_FURTHER_STARTS],
-            drawn[likely][:_FURTHER_STARTS],
-        ]
-        begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * _FURTHER_STARTS)
+        further = [_of_several_paths(posterior, ranked, starts)[:count], drawn[likely][:count]]
+        begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * count)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
