@@ -48,8 +48,8 @@ def beside_each_other(posterior: Posterior, drawn: Matrix, starts: int) -> Matri
         return drawn[:0]
     drawn = drawn[:count]
     units = posterior.responses(drawn)
-    read = [axis for axis, _ in enumerate(table.layout.responses) if _read(posterior, axis)]
-    axes = [_Axis.of(posterior, axis, units, count, groups) for axis in read]
+    responses = range(len(table.layout.responses))
+    axes = [_Axis.of(posterior, axis, units, count, groups) for axis in responses]
     ends = [_turned(axes, np.full(len(groups), k)) for k in range(min(starts, count))]
     chosen = np.unique(ends, axis=0)
     out = drawn[chosen[:, 0]]
@@ -68,10 +68,6 @@ def _groups(layout: Layout) -> list[Group]:
     alike = (elements[:, None] == elements) | (delays[:, None] == delays)
     count, labels = connected_components(alike, directed=False)
     return [tuple(paths[k] for k in np.flatnonzero(labels == label)) for label in range(count)]
-
-
-def _read(posterior: Posterior, axis: int) -> bool:
-    return any(one.axes[axis].values.size for one in posterior.samples)
 
 
 def _rows(table: ParameterTable, group: Group) -> list[int]:
