@@ -97,8 +97,8 @@ def find_optima(
     begun = _distinct(posterior, ranked, starts)
     if len(table.layout.paths) > 1:
         count = min(_FURTHER_STARTS, max(1, starts // 2))
-        likely = np.argsort(-likelihood[: len(poles)], kind="stable")
-        further = [_of_several_paths(posterior, ranked, starts)[:count], drawn[likely][:count]]
+        likely = drawn[: len(poles)][np.argsort(-likelihood[: len(poles)], kind="stable")]
+        further = [_of_several_paths(posterior, one, starts)[:count] for one in (ranked, likely)]
         begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * count)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
@@ -109,10 +109,10 @@ def find_optima(
     return _recombined(posterior, _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]))
 
 
-def _of_several_paths(posterior: Posterior, ranked: Matrix, starts: int) -> Matrix:
-    """Starts in which paths have draws of their own, likeliest first."""
-    found = beside_each_other(posterior, ranked, starts)
-    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else found
+def _of_several_paths(posterior: Posterior, drawn: Matrix, starts: int) -> Matrix:
+    """Starts in which paths have draws of their own, likeliest first; the draws where paths share."""
+    found = beside_each_other(posterior, drawn, starts)
+    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else drawn
 
 
 def _ranked(table: ParameterTable, values: Matrix, likelihoods: Matrix) -> Matrix:

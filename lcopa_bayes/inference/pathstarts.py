@@ -21,8 +21,8 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior, Units
 from lcopa_bayes.model.layout import Layout, PathSlot
 
-_DRAWS, _FEWEST = 512, 64
-"""Draws of each path, and fewest that are worth while [-]."""
+_DRAWS = 512
+"""Draws of each path [-]."""
 _CELLS = 5e6
 """Values of their responses that are held at once [-]."""
 _TURNS = 12
@@ -37,14 +37,14 @@ Group = tuple[PathSlot, ...]
 def beside_each_other(posterior: Posterior, drawn: Matrix, starts: int) -> Matrix:
     """Table values, (at most `starts`, rows), in which groups of paths have draws of their own.
 
-    `drawn`, (draws, rows), has the likeliest draws first: from each of the first `starts` the groups begin to
-    take turns. Of a plant of one group, or with a gain that is not linear, there are none.
+    From each of the first `starts` of `drawn`, (draws, rows), the groups begin to take turns. Of a plant of
+    one group, or with a gain that is not linear, there are none.
     """
     table = posterior.table
     groups = _groups(table.layout)
     gains = {table.at("gain", path.response, path.drive) for path in table.layout.paths}
     count = min(_DRAWS, len(drawn), int(_CELLS / (len(table.layout.units) * posterior.size)))
-    if len(groups) < 2 or count < _FEWEST or not gains <= set(posterior.linear):
+    if len(groups) < 2 or not count or not gains <= set(posterior.linear):
         return drawn[:0]
     drawn = drawn[:count]
     units = posterior.responses(drawn)

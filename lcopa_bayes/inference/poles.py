@@ -1,83 +1,121 @@
-"""Poles of a plant from a regression of each sample on the two before it.
+"""Poles of a plant from a regression of each sample on those before it.
 
 Starts that prior draws hardly meet: a lightly damped plant fills too little of the prior, and beside its
-resonance every delay of a whole number of half cycles is a local optimum.
+resonance every delay of a whole number of half cycles is a local optimum. Of several paths to a response the
+regression has two lags for each, and which pair of poles is whose is left to what uses them.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
 LAGS = (0, 1, 2, 3, 5, 8, 13, 21, 34)
 """Sampling periods of delay tried [-]."""
+_STEPS = (1, 4)
+"""Sampling periods from one sample of a regression to the next [-]: noise biases those of a fast clock."""
 _EVEN = 1e-2
-"""Gaps this close to one sampling period are one [periods]."""
-_FEWEST = 30
-"""Rows below which no regression is tried [-]."""
+"""How far samples may lie from an even grid [periods]."""
+_REAL = 1e-9
+"""Imaginary part over the modulus below which a pole is real [-]."""
+_FEWEST, _MOST = 30, 20_000
+"""Rows below which no regression is tried, and about which one record has at most [-]."""
+_SPARSE = 10
+"""Places of the grid per sample above which it is not filled [-]."""
 
 
 def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:
-    """Drawn table values, (draws, rows), with poles and delays from a regression at one lag each, (at most
-    lags, rows); none where the samples do not give them.
+    """Drawn table values, (draws, rows), with a pair of poles and a delay from regressions, one for each pair
+    and lag, (rows); none where the samples do not give them.
 
-    All paths to a response have the same poles. Only free parameters are set, and only to values of their
+    All paths to a response have the same pair. Only free parameters are set, and only to values of their
     domain; all other entries stay as drawn.
     """
-    table, samples, out = posterior.table, posterior.samples, list[Vector]()
+    table, out = posterior.table, list[Vector]()
     layout = table.layout
-    longest = max((one.times for one in samples), key=np.size)
+    longest = max((one.times for one in posterior.samples), key=np.size)
     period = float(np.median(np.diff(longest)))
-    for lag, row in zip(LAGS, drawn, strict=False):
-        wanted = dict[tuple[str, int, int], float]()
-        for i, (elements, delays) in enumerate(zip(layout.element_of, layout.delay_of, strict=True)):
-            poles = _poles(samples, i, lag, period)
-            if poles is None:
-                continue
-            wanted |= dict.fromkeys((("delay", d, 0) for d in delays), max(lag - 0.5, 0.1) * period)
-            for element in elements:
-                for term, (time, order) in enumerate(_terms(poles, layout.elements[element].terms)):
-                    wanted["time", element, term], wanted["order", element, term] = time, order
-        own = row.copy()
-        for (kind, first, second), value in wanted.items():
-            k = table.at(kind, first, second)
-            low, high = table.rows[k].domain
-            if table.rows[k].free and low <= value <= high:
-                own[k] = value
-        if wanted and table.supported(own[None])[0]:
-            out.append(own)
+    kinds = [(order, step) for order in dict.fromkeys((2, 2 * len(layout.drives))) for step in _STEPS]
+    for lag in LAGS:
+        found = [
+            [pair for kind in kinds for pair in _pairs(posterior.samples, i, lag, period, *kind)]
+            for i in range(len(layout.responses))
+        ]
+        for number in range(max(map(len, found))):
+            own = drawn[len(out) % len(drawn)].copy()
+            for i, pairs in enumerate(found):
+                if number < len(pairs):
+                    _set(own, table, i, pairs[number], max(lag - 0.5, 0.1) * period)
+            if table.supported(own[None])[0]:
+                out.append(own)
     return np.asarray(table.canonical(np.array(out))) if out else drawn[:0]
 
 
-def _poles(samples: tuple[Samples, ...], axis: int, lag: int, period: float) -> Vector | None:
-    """Both poles at a lag, decaying ones only [1 / time unit]; None where the samples do not give them."""
-    rows, values = [], []
+def _set(values: Vector, table: ParameterTable, response: int, poles: Vector, delay: float) -> None:
+    """Write poles and a delay of all paths to a response into table values."""
+    layout = table.layout
+    wanted = {("delay", d, 0): delay for d in layout.delay_of[response]}
+    for element in layout.element_of[response]:
+        for term, (time, order) in enumerate(_terms(poles, layout.elements[element].terms)):
+            wanted["time", element, term], wanted["order", element, term] = time, order
+    for (kind, first, second), value in wanted.items():
+        k = table.at(kind, first, second)
+        low, high = table.rows[k].domain
+        if table.rows[k].free and low <= value <= high:
+            values[k] = value
+
+
+def _pairs(
+    samples: Sequence[Samples], axis: int, lag: int, period: float, order: int, step: int
+) -> list[Vector]:
+    """Pairs of poles of a regression on so many samples, a step apart, at a lag; decaying ones only [1 / time
+    unit]."""
+    rows, values, first = [], [], order * step
     for one in samples:
-        observed = one.axes[axis]
-        y, at = observed.values, one.times[observed.index]
-        drive = one.record.drive
-        held = [
-            drive[
-                np.clip(np.searchsorted(one.record.time, at - k * period * (1 - 1e-6), "right") - 1, 0, None)
-            ]
-            for k in (lag, lag + 1)
-        ]
-        steady = np.abs(observed.gaps - 1.0) < _EVEN
-        use = np.flatnonzero(steady[2:] & steady[1:-1]) + 2
-        ones = np.ones((use.size, 1))
-        rows.append(np.hstack([y[use - 1, None], y[use - 2, None], held[0][use], held[1][use], ones]))
-        values.append(y[use])
+        at, y = _even(one, axis, period)
+        if at.size <= first:
+            continue
+        here = np.arange(first, at.size, max(1, at.size // _MOST))
+        before = at[here, None] - (lag + step * np.arange(2)) * period * (1 - 1e-6)
+        place = np.searchsorted(one.record.time, before, "right") - 1
+        held = one.record.drive[np.maximum(place, 0)].reshape(here.size, -1)
+        past = y[here[:, None] - step * np.arange(1, order + 1)]
+        matrix = np.column_stack([past, held, np.ones(here.size)])
+        use = np.isfinite(matrix).all(axis=1) & np.isfinite(y[here])
+        rows.append(matrix[use])
+        values.append(y[here][use])
+    if sum(map(len, values)) < _FEWEST:
+        return []
     matrix, right = np.vstack(rows), np.concatenate(values)
-    if right.size < _FEWEST:
-        return None
-    a1, a2 = np.linalg.lstsq(matrix, right, rcond=None)[0][:2]
-    z = np.roots([1.0, -a1, -a2]).astype(complex)
-    if not (np.abs(z) > 0).all() or (np.abs(z) >= 1).any() or ((z.imag == 0) & (z.real <= 0)).any():
-        return None
-    return np.asarray(np.log(z) / period)
+    z = np.roots([1.0, *-np.linalg.lstsq(matrix, right, rcond=None)[0][:order]]).astype(complex)
+    real = np.sort(z[np.abs(z.imag) <= _REAL * np.abs(z)].real)
+    ringing = z[z.imag > _REAL * np.abs(z)]
+    pairs = [np.array([one, one.conj()]) for one in ringing]
+    pairs += [np.array(pair, dtype=complex) for pair in zip(real[::2], real[1::2], strict=False)]
+    decaying = [one for one in pairs if (np.abs(one) < 1).all() and ((one.imag != 0) | (one.real > 0)).all()]
+    return [np.log(one) / (step * period) for one in decaying]
+
+
+def _even(one: Samples, axis: int, period: float) -> tuple[Vector, Vector]:
+    """Times and samples of an axis on an even grid, (n,) each; NaN where there is none, and between those of
+    a clock that is not even their interpolation. Nothing where samples fill little of it."""
+    observed = one.axes[axis]
+    at = one.times[observed.index]
+    if at.size < 2 or at[-1] - at[0] > _SPARSE * at.size * period:
+        return np.empty(0), np.empty(0)
+    grid = np.arange(at[0], at[-1] + 0.5 * period, period)
+    place = (at - at[0]) / period
+    if np.abs(place - np.round(place)).max() > _EVEN:
+        return grid, np.interp(grid, at, observed.values)
+    out = np.full(grid.size, np.nan)
+    out[np.round(place).astype(np.intp)] = observed.values
+    return grid, out
 
 
 def _terms(poles: Vector, count: int) -> list[tuple[float, float]]:

@@ -3,6 +3,8 @@ all paths at once miss."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small import TWO, problem, record
@@ -11,12 +13,11 @@ from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.pathstarts import beside_each_other
+from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.path import TransferPath
 
 COUPLED = record(device=TWO, camera=0.5)
-RINGING = TransferPath.of_times(1.0, 0.4, (2.0, 1.6), (2.0, 1.0))
-"""Second order, damping 0.4."""
 NOISE = 0.004
 
 
@@ -71,25 +72,42 @@ def test_paths_that_share_have_no_draws_of_their_own():
         assert beside_each_other(posterior, drawn, 2).shape == (0, drawn.shape[1])
 
 
-def two_oscillators() -> Record:
-    """One response to two drives that step at times of their own."""
+def oscillators(times: tuple[float, ...], jitter: float) -> Record:
+    """One response to drives that step at times of their own, each through a resonance of damping 0.4."""
     rng = np.random.default_rng(5)
-    time = np.linspace(0.0, 30.0, 250)
-    drive, response = np.zeros((time.size, 2)), NOISE * rng.standard_normal(time.size)
-    for j, changes in enumerate(time[[[40, 150], [85, 180]]]):
-        for at, size in zip(changes, (1.0, -0.5), strict=True):
-            drive[time >= at, j] += size
-            since = time - at - RINGING.delay
-            response += size * np.where(since > 0, unit_step(RINGING, np.maximum(since, 1e-9)), 0.0)
-    drives = (Axis("u1", "V"), Axis("u2", "V"))
+    time = np.linspace(0.0, 60.0, 300)
+    time[1:-1] += jitter * rng.uniform(-0.4, 0.4, 298) * time[1]
+    drive, response = np.zeros((time.size, len(times))), NOISE * rng.standard_normal(time.size)
+    for j, own in enumerate(times):
+        path = TransferPath.of_times(1.0, 0.4, (own, 0.8 * own), (2.0, 1.0))
+        for k, size in ((24 + 30 * j, 1.0), (150 + 36 * j, -0.6)):
+            drive[time >= time[k], j] += size
+            since = time - time[k] - path.delay
+            response += size * np.where(since > 0, unit_step(path, np.maximum(since, 1e-9)), 0.0)
+    drives = tuple(Axis(f"u{j + 1}", "V") for j in range(len(times)))
     return Record("on", time, drive, response[:, None], drives, (Axis("y", "V"),), "s")
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_two_oscillators_are_found(seed):
-    """With the noise of the record; a plant whose one path takes the part of the other leaves five times
-    that."""
-    posterior = problem(two_oscillators(), terms=2, share="none", delay="path").posterior
-    (best, *_) = find_optima(posterior, np.random.default_rng(seed), starts=4)
-    white = posterior.table.of_kind("sigma")
-    assert best.values[white] == pytest.approx(NOISE, rel=0.2)
+@pytest.mark.parametrize(("times", "jitter"), [((2.0, 2.0), 0.0), ((2.0, 5.0), 0.0), ((2.0, 3.0), 1.0)])
+@pytest.mark.parametrize("starts", [2, 4])
+def test_resonances_of_several_drives_are_found(times, jitter, starts):
+    """With the noise of the record; a plant whose one path takes the part of the other leaves five times that
+    or more."""
+    posterior = problem(oscillators(times, jitter), terms=2, share="none", delay="path").posterior
+    (best, *_) = find_optima(posterior, np.random.default_rng(1), starts=starts)
+    assert best.values[posterior.table.of_kind("sigma")] == pytest.approx(NOISE, rel=0.2)
+
+
+def test_poles_are_those_of_the_plant_on_any_clock():
+    """A pair of some regression is that of the plant to a fifth, on an even clock, on a jittered one and with
+    samples missing."""
+    even, jittered = oscillators((2.0,), 0.0), oscillators((2.0,), 1.0)
+    missing = np.where(np.arange(300)[:, None] % 7 == 3, np.nan, even.response)
+    for record_ in (even, jittered, replace(even, response=missing)):
+        posterior = problem(record_, terms=2).posterior
+        found = regressed(posterior, posterior.table.draw(100, np.random.default_rng(0)))
+        table = posterior.table
+        first, second = (found[:, table.at("time", 0, k)] for k in (0, 1))
+        assert (found[:, [table.at("order", 0, k) for k in (0, 1)]] == [2.0, 1.0]).all()
+        off = np.maximum(np.abs(np.log(first / 2.0)), np.abs(np.log(second / 1.6)))
+        assert off.min() < 0.2
