@@ -148,7 +148,11 @@ def sampled(tmp_path_factory) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "at", ["parameters.csv", "posterior.nc", "results.json", "data_01_a_y.svg", "report.html"]
+    "at",
+    [
+        *("posterior.nc", "results.json", "report.html"),
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("parameters.csv", "data_01_a_y.svg")),
+    ],
 )
 def test_whatever_file_fails_ends_with_exit_code_2(sampled, monkeypatch, capsys, at):
     out, replace = Path(sampled[-2]), os.replace

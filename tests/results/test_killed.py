@@ -44,7 +44,9 @@ def fleet(studies, tmp_path_factory) -> dict:
     return kill.reference("fleet", studies, tmp_path_factory.mktemp("runs") / "fleet", jobs=2)[0]
 
 
-@pytest.mark.parametrize("target", kill.TARGETS)
+@pytest.mark.parametrize(
+    "target", [pytest.param(one, marks=[pytest.mark.slow] * (one == "both")) for one in kill.TARGETS]
+)
 def test_a_killed_fleet_goes_on_to_the_same_table(studies, fleet, tmp_path, target):
     """When the first device has begun and none has ended, or one has."""
     out = tmp_path / "fleet"
