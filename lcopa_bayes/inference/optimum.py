@@ -110,9 +110,9 @@ def find_optima(
 
 
 def _of_several_paths(posterior: Posterior, drawn: Matrix, starts: int) -> Matrix:
-    """Starts in which paths have draws of their own, likeliest first; the draws where paths share."""
+    """Starts in which paths have draws of their own, likeliest first; none where all share."""
     found = beside_each_other(posterior, drawn, starts)
-    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else drawn
+    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else found
 
 
 def _ranked(table: ParameterTable, values: Matrix, likelihoods: Matrix) -> Matrix:
