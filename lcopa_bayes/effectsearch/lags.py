@@ -43,22 +43,25 @@ _CHANCE = 0.99
 def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
     """Sums of lags beside the plant of a final model and its linear effects, one for each response axis that
     has any."""
+    return lags_beside(fitted_plant(state, problem))
+
+
+def fitted_plant(state: State, problem: Problem) -> FittedPlant:
+    """The plant of a model with its linear effects, as sums of lags are held against it."""
     model = state.model
     constant = [effect.name for effect in model.effects if linear(effect)]
     others = [effect.name for effect in model.effects if not linear(effect)]
     plant = replace(model.plant, samples=_without(state, [*constant, *others]), noise=WhiteAR1())
     values = model.values(state.optimum.x)[: len(plant.table.rows)]
     more, acting = sum(len(places(model, name)) for name in constant), _acting(state, constant)
-    return lags_beside(
-        FittedPlant(
-            replace(problem, posterior=plant),
-            values,
-            state.whitening.held,
-            curves_of(plant.table, values[None], problem.scales.span),
-            problem.study.seed,
-            tuple(more * (axis in acting) for axis in range(len(state.whitening.noise))),
-            _without(state, others),
-        )
+    return FittedPlant(
+        replace(problem, posterior=plant),
+        values,
+        state.whitening.held,
+        curves_of(plant.table, values[None], problem.scales.span),
+        problem.study.seed,
+        tuple(more * (axis in acting) for axis in range(len(state.whitening.noise))),
+        _without(state, others),
     )
 
 

@@ -319,7 +319,7 @@ def _looped(
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, plants.held_against(lags, state), plants),
+        *(outliers, contrary, found, plants.held_against(lags, state, problem), plants),
     )
 
 

@@ -9,12 +9,13 @@ from typing import Self, final
 
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
+from lcopa_bayes.effectsearch.lags import fitted_plant
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.richerplants import WEIGHT, RicherPlants
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.results.sumsoflags import Alternative, parameters_of
+from lcopa_bayes.results.sumsoflags import Alternative
 
 
 @final
@@ -45,21 +46,22 @@ class PlantsBeside:
             number = self.integer.number(number, row)
         return self.richer.number(number, row)
 
-    def held_against(self, lags: Sequence[Alternative], chosen: State) -> tuple[Alternative, ...]:
+    def held_against(
+        self, lags: Sequence[Alternative], chosen: State, problem: Problem
+    ) -> tuple[Alternative, ...]:
         """Sums of lags beside the chosen plant, held against that with integer orders where it follows a
         response better by Akaike's criterion."""
-        if self.integer is None:
+        if self.integer is None or not lags:
             return tuple(lags)
-        states, out = (chosen, self.integer.plant.state), []
-        for one in lags:
-            parts = [part.rows for part in chosen.whitening.parts if part.axis == one.search.axis]
-            plant, integer = (
-                sum(float(at.optimum.white[rows] @ at.optimum.white[rows]) for rows in parts)
-                + 2 * parameters_of(at.model.plant.table, one.paths)
-                for at in states
-            )
-            out.append(replace(one, advantage=one.advantage - max(plant - integer, 0.0)))
-        return tuple(out)
+        plants = [fitted_plant(state, problem) for state in (chosen, self.integer.plant.state)]
+
+        def worse(one: Alternative) -> float:
+            """What the chosen plant lacks on a response."""
+            axis = one.search.axis
+            own, integer = (plant.square(axis) + 2 * plant.parameters(one.paths) for plant in plants)
+            return max(own - integer, 0.0)
+
+        return tuple(replace(one, advantage=one.advantage - worse(one)) for one in lags)
 
     @property
     def shares(self) -> tuple[tuple[str, float], ...]:

@@ -124,6 +124,22 @@ class FittedPlant:
         """Of its problem."""
         return self.problem.posterior
 
+    def square(self, axis: int) -> float:
+        """Its whitened residual on a response axis, squared [-]; of the samples that sums of lags follow."""
+        posterior, out = thinned(self.posterior), 0.0
+        assert isinstance(posterior.noise, GaussianNoise)
+        units = posterior.responses(self.values[None])
+        for r, samples in enumerate(posterior.samples):
+            observed = samples.axes[axis]
+            residual = posterior.residual(axis, r, observed, self.values[None], units[r])
+            white = posterior.noise.standard(residual, self.noise[axis][None], observed.gaps)
+            out += float((white**2).sum())
+        return out
+
+    def parameters(self, paths: Sequence[PathSlot]) -> int:
+        """Free parameters that paths to one response axis use, others of the axis included [-]."""
+        return _parameters(self.posterior.table, paths) + (self.more[paths[0].response] if self.more else 0)
+
 
 def lags_beside(plant: FittedPlant, kinds: Sequence[Kind] = KINDS) -> tuple[Alternative, ...]:
     """Sums of lags of these kinds beside a fitted plant, one for each response axis that has any; none where
@@ -220,23 +236,16 @@ def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
 def _alternative(
     plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...], kinds: Sequence[Kind]
 ) -> Alternative:
-    posterior, noise = thinned(plant.posterior), plant.noise[axis]
-    assert isinstance(posterior.noise, GaussianNoise)
-    units, square = posterior.responses(plant.values[None]), 0.0
-    for r, samples in enumerate(posterior.samples):
-        observed = samples.axes[axis]
-        residual = posterior.residual(axis, r, observed, plant.values[None], units[r])
-        square += float((posterior.noise.standard(residual, noise[None], observed.gaps) ** 2).sum())
+    square, noise = plant.square(axis), plant.noise[axis]
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 10 * _STREAM + axis
     searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends, kinds))
-    parameters = parameters_of(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
     best = searches[0].best
-    advantage = square + 2 * parameters - best.square - 2 * best.parameters
+    advantage = square + 2 * plant.parameters(paths) - best.square - 2 * best.parameters
     return Alternative(paths, searches, advantage, square, seed)
 
 
-def parameters_of(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
+def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
     """Free parameters of a plant that the paths use [-]."""
     used: set[int] = set()
     for one in paths:

@@ -20,6 +20,7 @@ from lcopa_bayes.effectsearch.lags import lags_of
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.inference import lagsum
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.response import EvenCurvature
 from lcopa_bayes.model.effects.sensor import SensorLag
@@ -144,13 +145,24 @@ def test_sums_of_lags_are_held_against_it() -> None:
     assert integer is not None
     found = lags_of(start, base.problem)
     assert [one.support for one in found] == ["lags"]
-    held = PlantsBeside(integer=integer).held_against(found, start)
+    held = PlantsBeside(integer=integer).held_against(found, start, base.problem)
     direct = lags_of(integer.plant.state, base.problem)
     assert [one.support for one in held] == [one.support for one in direct] == ["plant"]
     assert held[0].advantage == pytest.approx(direct[0].advantage, abs=0.1 * abs(direct[0].advantage))
     swapped = PlantsBeside(integer=replace(integer, plant=replace(integer.plant, state=start)))
-    assert swapped.held_against(found, start)[0].advantage == found[0].advantage
-    assert PlantsBeside().held_against(found, start) == found
+    assert swapped.held_against(found, start, base.problem)[0].advantage == found[0].advantage
+    assert PlantsBeside().held_against(found, start, base.problem) == found
+
+
+def test_of_long_records_both_are_of_the_samples_that_lags_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second one here."""
+    monkeypatch.setattr(lagsum, "_SAMPLES", 300)
+    base = based((RINGING,), 1)
+    start, integer = base.start, integer_plant(base.start, base.problem)
+    assert integer is not None
+    held = PlantsBeside(integer=integer).held_against(lags_of(start, base.problem), start, base.problem)
+    direct = lags_of(integer.plant.state, base.problem)
+    assert held[0].advantage == pytest.approx(direct[0].advantage, rel=0.1)
 
 
 def test_weights_follow_the_odds() -> None:
