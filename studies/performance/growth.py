@@ -13,8 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -26,6 +24,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from plots import COLOURS, save
+from probe import peak_memory
 
 import lcopa_bayes as lb
 from lcopa_bayes.bench.command import staircase
@@ -73,7 +72,7 @@ def response(samples: int) -> dict[str, float]:
         "response_s": median_of(lambda: posterior.model.unit_responses(at)),
         "slopes_s": median_of(lambda: posterior.model.unit_slopes(at)),
     }
-    return spent | {"memory_MB": peak()}
+    return spent | {"memory_MB": peak_memory()}
 
 
 def reading(samples: int, suffix: str) -> dict[str, float]:
@@ -81,9 +80,9 @@ def reading(samples: int, suffix: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"long{suffix}"
         save_record(record(samples), path)
-        before, begin = peak(), time.process_time()
+        before, begin = peak_memory(), time.process_time()
         load_record(path)
-        return {"read_s": time.process_time() - begin, "memory_MB": peak(), "before_MB": before}
+        return {"read_s": time.process_time() - begin, "memory_MB": peak_memory(), "before_MB": before}
 
 
 def fitted(samples: int, quick: bool) -> dict[str, Any]:
@@ -93,13 +92,13 @@ def fitted(samples: int, quick: bool) -> dict[str, Any]:
     if count > 1:
         begin = time.process_time()
         out["losses"] = [str(one) for one in averaging_losses(whole, (count, 2 * count))]
-        out["loss_s"], out["loss_MB"] = time.process_time() - begin, peak()
+        out["loss_s"], out["loss_MB"] = time.process_time() - begin, peak_memory()
         whole = averaged(whole, count)
     begin = time.process_time()
     fit = lb.fit(whole, quick=quick)
     return out | {
         "fit_s": time.process_time() - begin,
-        "memory_MB": peak(),
+        "memory_MB": peak_memory(),
         "grade": fit.draws.grade.level,
         "least_ess": min(one.ess for one in fit.draws.estimates()),
     }
@@ -114,14 +113,6 @@ def median_of(work: Callable[[], object], times: int = 5) -> float:
         work()
         spent.append(time.process_time() - begin)
     return float(np.median(spent))
-
-
-def peak() -> float:
-    """Most memory that this process has held [MB]; `getrusage` counts that of the process that started it."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        return float(re.findall(r"^VmHWM:\s*(\d+) kB$", status.read_text(), flags=re.MULTILINE)[0]) / 1e3
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 TASKS: dict[str, Callable[[int], dict[str, Any]]] = {
