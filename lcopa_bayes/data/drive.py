@@ -58,7 +58,7 @@ class AxisDrive:
     @cached_property
     def jumps(self) -> Vector:
         """Change of the drive at each instant [drive unit], (changes,)."""
-        return np.diff(self.values, prepend=0.0)
+        return frozen(np.diff(self.values, prepend=0.0), name="jumps")
 
     @property
     def moves(self) -> bool:

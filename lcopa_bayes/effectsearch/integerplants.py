@@ -180,7 +180,11 @@ def _starts(state: State, model: ExtendedModel, orders: Collection[str]) -> Iter
     old, table = state.model.plant.table, model.plant.table
     values = state.model.values(state.optimum.x)
     known = dict(zip(old.names, values, strict=False))
-    for share, alike in product(_SHORTER, (False, True)):
+    several = any(
+        slot.name in orders and len(own.times) > 1
+        for slot, own in zip(table.layout.elements, old.terms, strict=True)
+    )
+    for share, alike in product(_SHORTER, (False, True) if several else (False,)):
         out = np.array([known.get(row.name, row.value) for row in table.rows])
         for e, slot in enumerate(table.layout.elements):
             if slot.name in orders:

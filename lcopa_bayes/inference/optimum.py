@@ -95,11 +95,10 @@ def find_optima(
     own = len(drawn) - len(near)
     ranked = _ranked(table, drawn[:own], each[:, :own])
     begun = _distinct(posterior, ranked, starts)
-    if len(table.layout.paths) > 1:
-        count = min(_FURTHER_STARTS, max(1, starts // 2))
-        likely = drawn[: len(poles)][np.argsort(-likelihood[: len(poles)], kind="stable")]
-        further = [_of_several_paths(posterior, one, starts)[:count] for one in (ranked, likely)]
-        begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * count)
+    count = min(_FURTHER_STARTS, max(1, starts // 2))
+    likely = drawn[: len(poles)][np.argsort(-likelihood[: len(poles)], kind="stable")]
+    further = [_of_several_paths(posterior, one, starts)[:count] for one in (ranked, likely)]
+    begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * count)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))

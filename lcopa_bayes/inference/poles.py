@@ -2,16 +2,18 @@
 
 Starts that prior draws hardly meet: a lightly damped plant fills too little of the prior, and beside its
 resonance every delay of a whole number of half cycles is a local optimum. Of several paths to a response the
-regression has two lags for each, and which pair of poles is whose is left to what uses them.
+regression has two samples for each, and which pair of poles is whose is left to what uses them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
@@ -30,6 +32,17 @@ _SPARSE = 10
 """Places of the grid per sample above which it is not filled [-]."""
 
 
+@final
+class _Even(NamedTuple):
+    """Samples of one axis of a record on an even grid."""
+
+    record: Record
+    times: Vector
+    """(n,) [time unit]."""
+    values: Vector
+    """(n,) [response unit]."""
+
+
 def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:
     """Drawn table values, (draws, rows), with a pair of poles and a delay from regressions, one for each pair
     and lag, (rows); none where the samples do not give them.
@@ -42,11 +55,9 @@ def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:
     longest = max((one.times for one in posterior.samples), key=np.size)
     period = float(np.median(np.diff(longest)))
     kinds = [(order, step) for order in dict.fromkeys((2, 2 * len(layout.drives))) for step in _STEPS]
+    even = [[_even(one, i, period) for one in posterior.samples] for i in range(len(layout.responses))]
     for lag in LAGS:
-        found = [
-            [pair for kind in kinds for pair in _pairs(posterior.samples, i, lag, period, *kind)]
-            for i in range(len(layout.responses))
-        ]
+        found = [[pair for kind in kinds for pair in _pairs(own, lag, period, *kind)] for own in even]
         for number in range(max(map(len, found))):
             own = drawn[len(out) % len(drawn)].copy()
             for i, pairs in enumerate(found):
@@ -71,20 +82,17 @@ def _set(values: Vector, table: ParameterTable, response: int, poles: Vector, de
             values[k] = value
 
 
-def _pairs(
-    samples: Sequence[Samples], axis: int, lag: int, period: float, order: int, step: int
-) -> list[Vector]:
+def _pairs(records: Sequence[_Even], lag: int, period: float, order: int, step: int) -> list[Vector]:
     """Pairs of poles of a regression on so many samples, a step apart, at a lag; decaying ones only [1 / time
     unit]."""
     rows, values, first = [], [], order * step
-    for one in samples:
-        at, y = _even(one, axis, period)
+    for record, at, y in records:
         if at.size <= first:
             continue
         here = np.arange(first, at.size, max(1, at.size // _MOST))
         before = at[here, None] - (lag + step * np.arange(2)) * period * (1 - 1e-6)
-        place = np.searchsorted(one.record.time, before, "right") - 1
-        held = one.record.drive[np.maximum(place, 0)].reshape(here.size, -1)
+        place = np.searchsorted(record.time, before, "right") - 1
+        held = record.drive[np.maximum(place, 0)].reshape(here.size, -1)
         past = y[here[:, None] - step * np.arange(1, order + 1)]
         matrix = np.column_stack([past, held, np.ones(here.size)])
         use = np.isfinite(matrix).all(axis=1) & np.isfinite(y[here])
@@ -102,20 +110,20 @@ def _pairs(
     return [np.log(one) / (step * period) for one in decaying]
 
 
-def _even(one: Samples, axis: int, period: float) -> tuple[Vector, Vector]:
-    """Times and samples of an axis on an even grid, (n,) each; NaN where there is none, and between those of
-    a clock that is not even their interpolation. Nothing where samples fill little of it."""
+def _even(one: Samples, axis: int, period: float) -> _Even:
+    """NaN where a grid has no sample, and between those of a clock that is not even their interpolation;
+    nothing where samples fill little of it."""
     observed = one.axes[axis]
     at = one.times[observed.index]
     if at.size < 2 or at[-1] - at[0] > _SPARSE * at.size * period:
-        return np.empty(0), np.empty(0)
+        return _Even(one.record, np.empty(0), np.empty(0))
     grid = np.arange(at[0], at[-1] + 0.5 * period, period)
     place = (at - at[0]) / period
     if np.abs(place - np.round(place)).max() > _EVEN:
-        return grid, np.interp(grid, at, observed.values)
+        return _Even(one.record, grid, np.interp(grid, at, observed.values))
     out = np.full(grid.size, np.nan)
     out[np.round(place).astype(np.intp)] = observed.values
-    return grid, out
+    return _Even(one.record, grid, out)
 
 
 def _terms(poles: Vector, count: int) -> list[tuple[float, float]]:

@@ -54,8 +54,9 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
                 cases.append(moved)
         first += len(coefficients) * repeats
     moved_all = simulator.moved_together([(plant, each) for each in cases])
-    read = [simulator.finished(moved, each) for moved, each in zip(moved_all, cases, strict=True)]
-    out = [np.zeros((*y.shape, simulator.size)) for y in read[0]]
+    pairs = zip(moved_all, cases, strict=True) if parts else ()
+    read = [simulator.finished(moved, each) for moved, each in pairs]
+    out = [np.zeros((*deflection.shape, simulator.size)) for _, deflection in moved_all[0]]
     for columns, per_record, weights, place in parts:
         for r, there in enumerate(zip(read[0], *read[place], strict=True)):
             slope = sum(w * y for w, y in zip(weights, there, strict=True))
