@@ -16,7 +16,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
-from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
+from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
@@ -253,14 +253,14 @@ def _looped(
             start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone, crew=crew
         )
         if base.noise_known and not searched.rounds[-1].trace.alarmed:
-            searched = _settled(searched)
+            searched = searched.settled
             if not all(one.firm for one in base.noise) and not searched.state.model.effects:
                 # too few samples at rest leave noise plausible in which every effect drowns
                 unknown = (0,) * len(base.noise)
                 searched = search(
                     searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone, crew=crew
                 )
-                searched = _settled(searched)
+                searched = searched.settled
         searched = replace(searched, state=released(searched.state))
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if searched is None or (wrong and too_smooth(searched.state.optimum)):
@@ -277,17 +277,19 @@ def _looped(
     dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
     dynamics = dynamics or (integer_dynamics(searched.state, problem) if chosen else "")
     findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
+    extended, others = searched.state.model.effects, wider if chosen else None
+    plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others)
+    lags = plants.held_against(lags, searched.state, problem)
     preferred = any(one.support == "lags" for one in lags)
     verdict = decide(replace(findings, lags=dynamics, preferred=preferred))
     if verdict.kind == "unexplained" and not dynamics:
         lags = ()
-    elif verdict.kind == "unexplained" and searched.state.model.effects:
+    elif verdict.kind == "unexplained" and extended:
         lags = lags_of(before.state, problem)  # beside the plant without them
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
-    if not searched.state.model.effects:
-        before = reached
+    before = before if extended else reached
     after = reached if named else before
     state = after.state
     if named:
@@ -315,21 +317,14 @@ def _looped(
             after = drawn
     after = _side(problem, state) if sampled is None and state is not after.state else after
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
-    plants = PlantsBeside.of(state, problem, wider if chosen else None)
+    if extended:
+        plants = PlantsBeside.of(state, problem, others)
+        lags = plants.held_against(lags, state, problem)
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, plants.held_against(lags, state, problem), plants),
+        *(outliers, contrary, found, lags, plants),
     )
-
-
-def _settled(searched: Search) -> Search:
-    """The same under the noise that its residual has, unless something stands out from the noise."""
-    if searched.rounds[-1].trace.alarmed:
-        return searched
-    state = searched.state
-    optimum, whitening = settled(state.model, state.optimum, state.whitening)
-    return replace(searched, state=replace(state, optimum=optimum, whitening=whitening))
 
 
 def _names(state: State) -> tuple[str, ...]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import final
+from typing import Self, final
 
 import numpy as np
 
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basefit import settled
 from lcopa_bayes.effectsearch.candidates import refitted
 from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
@@ -95,6 +96,14 @@ class Search:
         nothing that another name might explain too remains."""
         alone = all(len(each) == 1 for each in self.groups)
         return self.brought >= FIRM and alone and not self.rounds[-1].trace.alarmed
+
+    @property
+    def settled(self) -> Self:
+        """The same under the noise that its residual has, unless something stands out from the noise."""
+        if self.rounds[-1].trace.alarmed:
+            return self
+        optimum, whitening = settled(self.state.model, self.state.optimum, self.state.whitening)
+        return replace(self, state=replace(self.state, optimum=optimum, whitening=whitening))
 
 
 def search(

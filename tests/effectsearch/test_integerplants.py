@@ -160,9 +160,11 @@ def test_of_long_records_both_are_of_the_samples_that_lags_follow(monkeypatch: p
     base = based((RINGING,), 1)
     start, integer = base.start, integer_plant(base.start, base.problem)
     assert integer is not None
-    held = PlantsBeside(integer=integer).held_against(lags_of(start, base.problem), start, base.problem)
-    direct = lags_of(integer.plant.state, base.problem)
-    assert held[0].advantage == pytest.approx(direct[0].advantage, rel=0.1)
+    (found,), (direct,) = (lags_of(state, base.problem) for state in (start, integer.plant.state))
+    (held,) = PlantsBeside(integer=integer).held_against([found], start, base.problem)
+    assert found.square < float(start.optimum.white @ start.optimum.white)
+    # both plants have four parameters: a gain, a delay, a time and an order; a gain, a delay and two times
+    assert found.advantage - held.advantage == pytest.approx(found.square - direct.square)
 
 
 def test_weights_follow_the_odds() -> None:
