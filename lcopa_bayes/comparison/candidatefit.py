@@ -262,7 +262,9 @@ def card(
     parts = predictions(fitted) if usable else ()
     result = criteria(fitted, also)
     # a diffusion has memory as fractional orders have: it is no rival of integer order
-    lags = alternatives_of(fitted, ["lags"]) if usable and not candidate.integer else ()
+    # where lags are no rival for all paths of a response, fractional orders are warranted in some
+    rivals = usable and not candidate.integer
+    lags = alternatives_of(fitted, ["lags"], single=False) if rivals else ()
     entries: dict[str, Any] = plain(
         {
             **attributes(candidate, "name", "about", "notes", "integer", "terms"),

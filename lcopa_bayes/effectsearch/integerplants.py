@@ -29,8 +29,8 @@ from lcopa_bayes.effectsearch.openeffects import LEAST, Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.refits import without
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED
+from lcopa_bayes.effectsearch.scores import State, fit_scores, held_out_scores, left_out_scores, over_noise
+from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED, Dynamics
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.parameter import Parameter
@@ -53,6 +53,8 @@ class IntegerPlant:
     """Those of each element that is held, by its name [-]."""
     log_odds: float
     """By the Bayesian information criterion, against the plant with free orders [nat]."""
+    problem: Problem
+    """The study with these orders."""
 
     @property
     def weight(self) -> float:
@@ -69,6 +71,14 @@ class IntegerPlant:
         """A gain or delay over this plant too; times of unlike orders are not the same numbers."""
         values = self.plant.number(row.name) if row.kind in ("gain", "delay") else None
         return number if values is None else number.beside([values], self.weight)
+
+    @property
+    def unseen(self) -> float:
+        """Largest root mean square error of any axis on unseen records over the noise [-]."""
+        state = self.plant.state
+        held_out = self.problem.study.held_out
+        unseen = held_out_scores(state, self.problem) if held_out else left_out_scores(state)
+        return over_noise(fit_scores(state), unseen, clear=True)
 
     @property
     def said(self) -> str:
@@ -95,26 +105,28 @@ def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
     return best if best is not None and best.log_odds > log(LEAST) else None
 
 
-def integer_dynamics(state: State, problem: Problem) -> str:
-    """In words, that a plant with integer orders and without the effects of a final state follows the records
-    as well, to the noise; empty where it does not, or where an effect is nonlinear or changes with time."""
+def integer_dynamics(state: State, problem: Problem) -> Dynamics | None:
+    """A plant with integer orders and without the effects of a final state, where it follows the fitted
+    records as well, to the noise; None where it does not, or where an effect is nonlinear or changes with
+    time."""
     effects = state.model.effects
     if not effects or not all(map(linear, effects)):
-        return ""
+        return None
     model, x = without(state.model, state.optimum.x, [effect.name for effect in effects])
     try:
         bare = replace(state, model=model, optimum=Regression(model, state.whitening).descend(x))
     except ArithmeticError:
-        return ""
+        return None
     found = integer_plant(bare, problem)
     if found is None:
-        return ""
+        return None
     own = found.plant.state.optimum
     gained = OtherPlant.beside(state, found.plant.state.model, own).gained
     left = float(own.white @ own.white) / own.white.size
     if gained + _saved(state, own.x.size) < -MARGIN or left > REACHED**2:
-        return ""
-    return f"elements of integer orders ({_listed(found.orders)}) follow the records as well"
+        return None
+    said = f"elements of integer orders ({_listed(found.orders)}) follow the records as well"
+    return Dynamics(said, found.unseen)
 
 
 def _saved(state: State, size: int) -> float:
@@ -158,7 +170,7 @@ def _held(state: State, problem: Problem, orders: dict[str, tuple[float, ...]]) 
     except (ArithmeticError, InputError):
         return None
     plant = OtherPlant.beside(state, model, optimum)
-    return IntegerPlant(plant, orders, plant.gained + _saved(state, optimum.x.size))
+    return IntegerPlant(plant, orders, plant.gained + _saved(state, optimum.x.size), own)
 
 
 def _with_orders(study: Study, table: ParameterTable, orders: dict[str, tuple[float, ...]]) -> Study:

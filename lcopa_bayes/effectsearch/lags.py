@@ -19,7 +19,7 @@ from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.refits import places, without
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.verdict import REACHED
+from lcopa_bayes.effectsearch.verdict import REACHED, Dynamics
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Samples
@@ -41,8 +41,8 @@ _CHANCE = 0.99
 
 
 def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
-    """Sums of lags beside the plant of a final model and its linear effects, one for each response axis that
-    has any."""
+    """Sums of lags beside the plant of a final model and its linear effects, of each response axis that has
+    any."""
     return lags_beside(fitted_plant(state, problem))
 
 
@@ -65,8 +65,8 @@ def fitted_plant(state: State, problem: Problem) -> FittedPlant:
     )
 
 
-def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[int]) -> str:
-    """In words, that sums of lags are all that the records ask for; empty where they are not.
+def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[int]) -> Dynamics | None:
+    """Sums of lags, where they are all that the fitted records ask for; None where they are not.
 
     They are where no effect of a final model is nonlinear, they have support on every response axis on which
     a linear one acts, or without any on one at least, and leave, or the plant where that is better, no more
@@ -75,13 +75,17 @@ def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[
     effects = state.model.effects
     supported = [one for one in found if one.support != "plant"]
     if not supported or not all(linear(effect) for effect in effects):
-        return ""
+        return None
     acting = _acting(state, [effect.name for effect in effects])
-    left = all(_at_noise(one, quiet[one.search.axis]) for one in found)
-    if not left or not acting <= {one.search.axis for one in supported}:
-        return ""
+    left = {one.search.axis for one in found if _at_noise(one, quiet[one.search.axis])}
+    if left < {one.search.axis for one in found} or not acting <= {one.search.axis for one in supported}:
+        return None
     names = state.model.plant.table.layout.responses
-    return f"{supported[0].said} follow {listed([names[one.search.axis].name for one in supported])} as well"
+    followed = dict.fromkeys(
+        listed([path.name for path in one.paths]) if one.beside else names[one.search.axis].name
+        for one in supported
+    )
+    return Dynamics(f"{supported[0].said} follow {listed(list(followed))} as well")
 
 
 def _at_noise(one: Alternative, quiet: int) -> bool:
@@ -127,9 +131,9 @@ def figures_with_lags(
         return tuple(figures)
     weights, time = weights_of(layout, found), step_times(span)
     lags = {one.name: one.values for one in lag_figures(supported, time, time_unit)}
+    shares = {one.name: weight_in(one.name, weights) for one in figures if one.name in lags}
     return tuple(
-        one.beside([lags[one.name]], weight_in(one.name, weights)) if one.name in lags else one
-        for one in figures
+        one.beside([lags[one.name]], shares[one.name]) if shares.get(one.name) else one for one in figures
     )
 
 

@@ -275,14 +275,15 @@ def _looped(
     reached = _side(problem, searched.state)
     lags = lags_of(searched.state, problem) if chosen else ()
     dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
-    dynamics = dynamics or (integer_dynamics(searched.state, problem) if chosen else "")
+    if dynamics is None and chosen:
+        dynamics = integer_dynamics(searched.state, problem)
     findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
     extended, others = searched.state.model.effects, wider if chosen else None
     plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others)
     lags = plants.held_against(lags, searched.state, problem)
     preferred = any(one.support == "lags" for one in lags)
-    verdict = decide(replace(findings, lags=dynamics, preferred=preferred))
-    if verdict.kind == "unexplained" and not dynamics:
+    verdict = decide(replace(findings, linear=dynamics, preferred=preferred))
+    if verdict.kind == "unexplained" and dynamics is None:
         lags = ()
     elif verdict.kind == "unexplained" and extended:
         lags = lags_of(before.state, problem)  # beside the plant without them

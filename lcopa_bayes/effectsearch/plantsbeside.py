@@ -58,7 +58,8 @@ class PlantsBeside:
         def worse(one: Alternative) -> float:
             """What the chosen plant lacks on a response."""
             axis = one.search.axis
-            own, integer = (plant.square(axis) + 2 * plant.parameters(one.paths) for plant in plants)
+            paths = (*one.paths, *one.beside)
+            own, integer = (plant.square(axis) + 2 * plant.parameters(paths) for plant in plants)
             return max(own - integer, 0.0)
 
         return tuple(replace(one, advantage=one.advantage - worse(one)) for one in lags)

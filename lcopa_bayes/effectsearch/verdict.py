@@ -84,6 +84,22 @@ class Miss:
 
 @final
 @dataclass(frozen=True)
+class Dynamics:
+    """A linear plant of another form that follows the fitted records to the noise."""
+
+    said: str
+    """What it is, and that it follows them as well; to be followed by "as any effect"."""
+    unseen: float = math.nan
+    """Largest error of any axis on unseen records over the noise [-]; NaN where it was not predicted."""
+
+    @property
+    def astray(self) -> bool:
+        """Whether it leaves more than the noise on unseen records."""
+        return self.unseen > REACHED
+
+
+@final
+@dataclass(frozen=True)
 class Findings:
     """What a loop found, as far as the verdict depends on it."""
 
@@ -134,8 +150,8 @@ class Findings:
     differ from record to record."""
     nothing: float = 1.0
     """Probability that nothing more is missing, by the last residual [-]."""
-    lags: str = ""
-    """In words, that sums of lags, or integer orders, are all that is missing; empty where they are not."""
+    linear: Dynamics | None = None
+    """Sums of lags, or integer orders, where they are all that the fitted records ask for."""
     preferred: bool = False
     """Whether the records prefer sums of lags to the plant on a response axis."""
 
@@ -148,6 +164,7 @@ def decide(given: Findings) -> Verdict:
     refused = _refused(given)
     if refused:
         apart = given.apart or not given.effects
+        apart = apart and not (given.linear and given.linear.astray)
         return Verdict("unexplained", confidence if apart else "tentative", refused)
     named, one = ", ".join(given.effects), len(given.effects) == 1
     rest = " Nothing significant remains."
@@ -176,10 +193,13 @@ def decide(given: Findings) -> Verdict:
 
 def _refused(given: Findings) -> str:
     """Why nothing is named though something is missing; empty where something is."""
-    if given.lags:
+    if given.linear:
+        left = "no more than the noise"
+        if given.linear.astray:
+            left += f" on the fitted records, but {given.linear.unseen:.2f} times that on unseen ones"
         return (
-            f"Unmodelled linear dynamics are missing: {given.lags} as any effect, and leave no more than the "
-            "noise. No name is forced; figures of the step responses are over them."
+            f"Unmodelled linear dynamics are missing: {given.linear.said} as any effect, and leave {left}. "
+            "No name is forced; figures of the step responses are over them."
         )
     if given.dynamics and not given.effects:
         return (

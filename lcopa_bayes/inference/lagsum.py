@@ -16,24 +16,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import final
 
 import numpy as np
 from scipy.linalg import eigh, orth
-from scipy.optimize import least_squares
 from scipy.sparse import csr_array
-from scipy.stats.qmc import Halton
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-MOST = 4
-"""Most lags of a path."""
 _PER_DECADE = 10
 """Tabulated time constants in a decade [-]: between them a response is interpolated to 1e-4."""
 _SHORTEST, _LONGEST = 0.5, 3.0
@@ -49,15 +43,6 @@ _SAMPLES = 4_000
 """Most samples of a response axis: of more one in so many is used, which widens intervals."""
 _VALUES = 4_000_000
 """Most values simulated at once."""
-_APART = 0.7
-"""Least distance of the time constants a search starts from [-, natural logarithm]."""
-_STARTS = 3
-"""Places where a further lag is tried."""
-_TRIED, _AGAIN, _LOWER = 1_000, 3, 0.5
-"""Places that a path is begun again from, most times that this is done, and least fall of the square
-for which it is done once more [-]."""
-_STEP = 1e-7
-"""Step of a difference quotient, over the range of its coordinate [-]."""
 
 
 @final
@@ -171,118 +156,6 @@ class Conditional:
         return np.asarray(np.linalg.solve(self.root.swapaxes(1, 2), standard[..., None])[..., 0])
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class LagFit:
-    """Least squares with so many lags in every path."""
-
-    lags: int
-    coordinates: Vector
-    """Log times path by path, then delays, (dimension,)."""
-    jacobian: Matrix
-    square: float
-    """Whitened residual and weights, squared [-]."""
-    size: int
-
-    @property
-    def parameters(self) -> int:
-        """Time constants, weights and delays [-]."""
-        paths = self.coordinates.size // (self.lags + 1)
-        return paths * (2 * self.lags + 1)
-
-    @property
-    def bic(self) -> float:
-        """Up to what all fits of one record have in common [-]."""
-        return float(self.square + self.parameters * np.log(self.size))
-
-    @cached_property
-    def covariance(self) -> Matrix:
-        """Of the coordinates near the optimum, (dimension, dimension)."""
-        return covariance_of(self.jacobian.T @ self.jacobian)
-
-
-def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
-    """The best of a few searches for each number of lags, 1 to `MOST`: a further lag begins where it alone
-    explains most of what the others leave, and the best begins again with lags and delays of each path from
-    everywhere."""
-    fits: list[LagFit] = []
-    for lags in range(1, MOST + 1):
-        tried = [_descended(table, lags, start) for start in _starts(table, fits[-1] if fits else None)]
-        best = min(tried, key=lambda one: one.square)
-        for _ in range(_AGAIN):
-            again = _descended(table, lags, _exchanged(table, best.coordinates))
-            if again.square > best.square - _LOWER:
-                break
-            best = again
-        fits.append(best)
-    return tuple(fits)
-
-
-def _exchanged(table: LagTable, coordinates: Vector) -> Vector:
-    """Coordinates with lags and delay of one path after the other exchanged for those, of many, that explain
-    most beside the others: a few starts for all paths alike miss what each of them needs."""
-    low, high = table.ends((coordinates.size - table.paths) // table.paths)
-    places = np.arange(coordinates.size - table.paths).reshape(table.paths, -1)
-    anywhere = Halton(places.shape[1] + 1, scramble=False).random(_TRIED + 1)[1:]
-    for path in range(table.paths):
-        own = np.append(places[path], places.size + path)
-        tried = np.tile(coordinates, (_TRIED, 1))
-        tried[:, own] = low[own] + (high[own] - low[own]) * anywhere
-        coordinates = tried[int(table.conditional(tried).log_marginal.argmax())]
-    return coordinates
-
-
-def best_of(fits: Sequence[LagFit]) -> LagFit:
-    """The one of the least BIC."""
-    return min(fits, key=lambda one: one.bic)
-
-
-def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
-    nodes = table.log_times[table.log_times >= table.shortest][2:-2]
-    if fewer is None:
-        low, high = table.delays[:, 0], table.delays[:, -1]
-        places = np.quantile(nodes, (0.25, 0.5, 0.75))
-        return [
-            np.concatenate([np.full(table.paths, place), low + share * (high - low)])
-            for place in places
-            for share in (0.1, 0.5, 0.9)
-        ]
-    log_times, delays = table.parts(fewer.coordinates[None])
-    further = np.broadcast_to(nodes[:, None, None], (nodes.size, table.paths, 1))
-    every = np.concatenate([np.repeat(log_times, nodes.size, axis=0), further], axis=2)
-    flat = every.reshape(nodes.size, -1)
-    starts = np.concatenate([flat, np.repeat(delays, nodes.size, axis=0)], axis=1)
-    chosen: list[int] = []
-    for k in np.argsort(-table.conditional(starts).log_marginal):
-        if all(abs(nodes[k] - nodes[other]) > _APART for other in chosen):
-            chosen.append(int(k))
-    return list(starts[chosen[:_STARTS]])
-
-
-def _descended(table: LagTable, lags: int, start: Vector) -> LagFit:
-    low, high = table.ends(lags)
-    steps = _STEP * (high - low)
-
-    def residual(x: Vector) -> Vector:
-        return np.asarray(table.residuals(x[None])[0])
-
-    def slopes(x: Vector) -> Matrix:
-        own = np.where(x + steps > high, -steps, steps)
-        values = table.residuals(np.concatenate([x[None], x + np.diag(own)]))
-        return np.asarray((values[1:] - values[0]).T / own)
-
-    optimum = least_squares(
-        residual,
-        np.clip(start, low, high),
-        slopes,
-        bounds=(low, high),
-        x_scale=high - low,
-        max_nfev=40,
-    )
-    square = 2 * float(optimum.cost) + table.remainder
-    return LagFit(lags, optimum.x, np.asarray(optimum.jac), square, table.size)
-
-
 def cubic(at: Array) -> tuple[Array, ...]:
     """Lagrange weights of nodes 0, 1, 2 and 3."""
     a, b, c = at - 1, at - 2, at - 3
@@ -312,11 +185,19 @@ def thinned(posterior: Posterior) -> Posterior:
     return replace(posterior, samples=tuple(kept)) if step > 1 else posterior
 
 
-def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix) -> LagTable:
+def lag_table(
+    problem: Problem,
+    axis: int,
+    drives: Sequence[int],
+    noise: Vector,
+    delays: Matrix,
+    open_to: Sequence[Matrix] = (),
+) -> LagTable:
     """Responses of one axis to some drives, of a `lag_problem` under Gaussian `noise` (parameters,).
 
     `delays` (paths, delays) [time unit] are those tabulated. A weight is in ranges of the response over
-    ranges of the drive (`Scales`).
+    ranges of the drive (`Scales`). The samples of every record may lie anywhere along what they are `open_to`
+    (directions, samples), as along their offsets.
     """
     posterior, scales = problem.posterior, problem.scales
     assert isinstance(posterior.noise, GaussianNoise)
@@ -337,18 +218,25 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
         held = values[:1].copy()
         held[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
         target = posterior.residual(axis, r, observed, held, none)
-        whole = np.concatenate([columns, np.reshape(own, (len(offsets), observed.values.size)), target])
+        own = [*own, *(open_to[r] if open_to else ())]
+        whole = np.concatenate([columns, np.reshape(own, (len(own), observed.values.size)), target])
         if observed.values.size:
             white.append(posterior.noise.whiten(whole[None], noise[None], observed.gaps)[0][0])
     joined = np.concatenate(white, axis=1)
-    if offsets:
-        basis = orth(joined[count:-1].T)
+    if len(joined) > count + 1:
+        basis = orth(_unit_rows(joined[count:-1]).T)
         joined = joined - (joined @ basis) @ basis.T
     reduced, target = _reduced(joined[:count], joined[-1])
     remainder = max(0.0, float(joined[-1] @ joined[-1] - target @ target))
     shape = (1, len(drives), log_times.size, delays.shape[1], -1)
     shortest = float(np.log(_SHORTEST * scales.period))
     return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, joined.shape[1], shortest)
+
+
+def _unit_rows(rows: Matrix) -> Matrix:
+    """Rows of length 1, and those of length 0."""
+    lengths = np.sqrt((rows**2).sum(axis=1, keepdims=True))
+    return np.asarray(rows / np.where(lengths == 0.0, 1.0, lengths))
 
 
 def _columns(problem: Problem, axis: int, drives: Sequence[int], values: Matrix) -> list[Matrix]:

@@ -171,7 +171,7 @@ class LeastSquares:
         values, source = table.sorted_with_source(raw[None], every=True)
         jacobian = np.zeros((posterior.size, len(table.rows)))
         parts, start = [], 0
-        blocks = self._plain(values) if posterior.simulation is None else self._effected(values)
+        blocks = self.plain_slopes(values) if posterior.simulation is None else self._effected(values)
         for axis, observed, block, misfit in blocks:
             stop = start + observed.values.size
             stacked = np.concatenate([block.T, misfit[None]])
@@ -189,9 +189,10 @@ class LeastSquares:
         rows, prior = self._prior_rows(raw)
         return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
 
-    def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
+    def plain_slopes(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model
-        minus data) of every axis of every record, of the plant without effects."""
+        minus data) of every axis of every record, of the plant without effects at canonical table values
+        (1, rows)."""
         posterior, table = self.posterior, self.posterior.table
         slopes = posterior.model.unit_slopes(table.dynamics(values))
         for r, samples in enumerate(posterior.samples):

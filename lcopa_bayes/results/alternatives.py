@@ -80,7 +80,7 @@ class Alternatives:
     """Sums of lags beside a fitted plant, and the numbers that both have."""
 
     alternatives: tuple[Alternative, ...]
-    """One per response axis that has any."""
+    """Of every response axis that has any."""
     numbers: tuple[Averaged, ...]
     """Figures of the step responses that the sums of lags have a part in."""
 
@@ -131,9 +131,11 @@ class Alternatives:
         )
 
 
-def alternatives_of(fitted: Fit, kinds: Sequence[Kind] = KINDS) -> tuple[Alternative, ...]:
-    """Sums of lags of these kinds beside a fit; none where its noise is not normal, its plant has effects, or
-    `lags_beside` has none."""
+def alternatives_of(
+    fitted: Fit, kinds: Sequence[Kind] = KINDS, *, single: bool = True
+) -> tuple[Alternative, ...]:
+    """Sums of lags of these kinds beside a fit, perhaps for `single` paths; none where its noise is not
+    normal, its plant has effects, or `lags_beside` has none."""
     posterior, draws = fitted.problem.posterior, fitted.draws
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
         return ()
@@ -142,7 +144,8 @@ def alternatives_of(fitted: Fit, kinds: Sequence[Kind] = KINDS) -> tuple[Alterna
     axes = range(len(posterior.table.layout.responses))
     noise = tuple(posterior.noise_parameters(best, axis)[0] for axis in axes)
     seed = fitted.run.plan.seed
-    return lags_beside(FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed), kinds)
+    plant = FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed)
+    return lags_beside(plant, kinds, single=single)
 
 
 def with_alternatives(fitted: Fit) -> Fit:

@@ -1,7 +1,9 @@
 """Sums of lags beside a fitted plant: what its paths may be if they are no Kelvin elements.
 
 Each response axis has its own, held against the fitted plant by Akaike's criterion: other families follow the
-records as well, and have other steady values and delays.
+records as well, and have other steady values and delays. Where sums of lags for all paths to an axis do not
+follow it, because one of them rings, each path has its own beside the others as they are fitted: what these
+add is taken off the samples, which may lie anywhere along its slopes in their parameters.
 """
 
 from __future__ import annotations
@@ -13,12 +15,13 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
+from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
@@ -54,6 +57,8 @@ class Alternative:
     """Whitened residual of the fitted plant, squared [-]."""
     seed: int
     """Of the draws."""
+    beside: tuple[PathSlot, ...] = ()
+    """Paths to the same axis that stay as they are fitted."""
 
     @property
     def search(self) -> LagSearch:
@@ -91,6 +96,7 @@ class Alternative:
         times = np.exp(best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
         return {
             "paths": [one.name for one in self.paths],
+            "beside": [one.name for one in self.beside],
             "kind": self.search.kind,
             "said": self.said,
             "lags": best.lags,
@@ -138,22 +144,32 @@ class FittedPlant:
 
     def parameters(self, paths: Sequence[PathSlot]) -> int:
         """Free parameters that paths to one response axis use, others of the axis included [-]."""
-        return _parameters(self.posterior.table, paths) + (self.more[paths[0].response] if self.more else 0)
+        return len(_used(self.posterior.table, paths)) + (self.more[paths[0].response] if self.more else 0)
 
 
-def lags_beside(plant: FittedPlant, kinds: Sequence[Kind] = KINDS) -> tuple[Alternative, ...]:
-    """Sums of lags of these kinds beside a fitted plant, one for each response axis that has any; none where
-    no drive moves or the records do not determine them."""
+def lags_beside(
+    plant: FittedPlant, kinds: Sequence[Kind] = KINDS, *, single: bool = True
+) -> tuple[Alternative, ...]:
+    """Sums of lags of these kinds beside a fitted plant: for each response axis that has any one for all of
+    its paths, or, if `single`, where this has no support, one for each path that has; none where no drive
+    moves or the records do not determine them."""
     try:
         own = plant.posterior
         followed = own if plant.samples is None else replace(own, samples=plant.samples)
         problem = lag_problem(plant.problem.study, followed)
     except InputError:
         return ()
-    open_paths = [_open(plant.posterior, axis) for axis in range(len(plant.noise))]
-    return tuple(
-        _alternative(plant, problem, axis, paths, kinds) for axis, paths in enumerate(open_paths) if paths
-    )
+    out = []
+    for axis in range(len(plant.noise)):
+        paths = _open(plant.posterior, axis)
+        if not paths:
+            continue
+        every = _alternative(plant, problem, axis, paths, kinds)
+        each: list[Alternative] = []
+        if single and every.support == "plant" and len(paths) > 1:
+            each = [_alternative(plant, problem, axis, (one,), kinds) for one in paths]
+        out += [one for one in each if one.support != "plant"] or [every]
+    return tuple(out)
 
 
 def sentence_of(found: Sequence[Alternative]) -> str:
@@ -165,11 +181,15 @@ def sentence_of(found: Sequence[Alternative]) -> str:
         "plant": "do not follow the records as well as the fitted plant does",
     }
     return " ".join(
-        f"{one.said[0].upper()}{one.said[1:]}"
-        f"{f' for {listed([path.name for path in one.paths])}' if len(found) > 1 else ''} "
+        f"{one.said[0].upper()}{one.said[1:]}{_where(one) if len(found) > 1 or one.beside else ''} "
         f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by {abs(one.advantage):.1f})."
         for one in found
     )
+
+
+def _where(one: Alternative) -> str:
+    beside = ", beside the other paths as they are fitted," if one.beside else ""
+    return f" for {listed([path.name for path in one.paths])}{beside}"
 
 
 def weights_of(layout: Layout, found: Sequence[Alternative]) -> dict[str, float]:
@@ -237,22 +257,48 @@ def _alternative(
     plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...], kinds: Sequence[Kind]
 ) -> Alternative:
     square, noise = plant.square(axis), plant.noise[axis]
+    beside = tuple(one for one in _open(plant.posterior, axis) if one not in paths)
+    problem, open_to = _without(problem, plant, beside)
     ends = np.array([_ends(plant, one) for one in paths])
-    seed = plant.seed * 1_000 + 10 * _STREAM + axis
-    searches = likely(LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends, kinds))
+    seed = plant.seed * 1_000 + 100 * paths[0].drive + 10 * _STREAM + axis
+    drives = [one.drive for one in paths]
+    searches = likely(LagSearch.over(problem, axis, drives, noise, ends, kinds, open_to))
     best = searches[0].best
-    advantage = square + 2 * plant.parameters(paths) - best.square - 2 * best.parameters
-    return Alternative(paths, searches, advantage, square, seed)
+    parameters = best.parameters + len(_used(plant.posterior.table, beside))
+    advantage = square + 2 * plant.parameters((*paths, *beside)) - best.square - 2 * parameters
+    return Alternative(paths, searches, advantage, square, seed, beside)
 
 
-def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
-    """Free parameters of a plant that the paths use [-]."""
+def _without(
+    problem: Problem, plant: FittedPlant, beside: Sequence[PathSlot]
+) -> tuple[Problem, tuple[Matrix, ...]]:
+    """A `lag_problem` less what some paths to one response axis add as they are fitted, and the slopes of
+    that in their parameters, record by record (parameters, samples)."""
+    if not beside:
+        return problem, ()
+    table, axis = plant.posterior.table, beside[0].response
+    gains = [table.at("gain", axis, one.drive) for one in beside]
+    used, values = sorted(_used(table, beside)), plant.values.copy()
+    values[[k for k in table.of_kind("gain") if k not in gains]] = 0.0
+    posterior = replace(plant.posterior, samples=problem.posterior.samples)
+    own = (block for at, _, block, _ in LeastSquares(posterior).plain_slopes(values[None]) if at == axis)
+    samples, open_to = [], []
+    for record, slopes in zip(posterior.samples, own, strict=True):
+        axes, observed = list(record.axes), record.axes[axis]
+        axes[axis] = replace(observed, values=observed.values - slopes[:, gains] @ values[gains])
+        samples.append(replace(record, axes=tuple(axes)))
+        open_to.append(slopes[:, used].T)
+    return replace(problem, posterior=replace(problem.posterior, samples=tuple(samples))), tuple(open_to)
+
+
+def _used(table: ParameterTable, paths: Sequence[PathSlot]) -> set[int]:
+    """Table positions of the free parameters of a plant that the paths use."""
     used: set[int] = set()
     for one in paths:
         used.add(table.at("gain", one.response, one.drive))
         used.add(table.at("delay", table.layout.delay_of[one.response][one.drive]))
         used.update(table.terms[table.layout.element_of[one.response][one.drive]].every)
-    return sum(table.rows[k].free for k in used)
+    return {k for k in used if table.rows[k].free}
 
 
 def _ends(plant: FittedPlant, path: PathSlot) -> tuple[float, float]:

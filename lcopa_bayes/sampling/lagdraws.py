@@ -25,7 +25,8 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.diffusion import KINDS, Kind, diffused, rises
-from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, best_of, lag_fits, lag_table
+from lcopa_bayes.inference.lagfits import MOST, LagFit, best_of, lag_fits
+from lcopa_bayes.inference.lagsum import LagTable, lag_table
 from lcopa_bayes.sampling.importanceweights import usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.proposal import Seen, adapted
@@ -75,6 +76,8 @@ class LagSearch:
     """Those between which they are tabulated, (paths, 2) [time unit]."""
     kind: Kind = "lags"
     """What the first component of a path is."""
+    open_to: tuple[Matrix, ...] = ()
+    """Directions along which the samples of each record may lie anywhere, (directions, samples), or none."""
 
     @classmethod
     def over(
@@ -85,14 +88,15 @@ class LagSearch:
         noise: Vector,
         delays: Matrix,
         kinds: Sequence[Kind] = KINDS,
+        open_to: tuple[Matrix, ...] = (),
     ) -> tuple[LagSearch, ...]:
         """Searches over all delays between their ends (paths, 2) [time unit], and again where they are, of
         every kind that may follow the records best."""
-        table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
+        table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE), open_to)
         fits = {kind: lag_fits(diffused(table, kind)) for kind in kinds}
         least = min(best_of(own).bic for own in fits.values())
         return tuple(
-            cls(problem, axis, tuple(drives), noise, delays, _near(table, own, delays), kind)
+            cls(problem, axis, tuple(drives), noise, delays, _near(table, own, delays), kind, open_to)
             for kind, own in fits.items()
             if best_of(own).bic < least + _NEAR
         )
@@ -100,7 +104,8 @@ class LagSearch:
     @cached_property
     def table(self) -> LagTable:
         """Responses of the delays that are tabulated."""
-        lags = lag_table(self.problem, self.axis, self.drives, self.noise, _nodes(self.near, _FINE))
+        nodes = _nodes(self.near, _FINE)
+        lags = lag_table(self.problem, self.axis, self.drives, self.noise, nodes, self.open_to)
         return diffused(lags, self.kind)
 
     @cached_property

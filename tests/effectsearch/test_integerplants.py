@@ -207,21 +207,40 @@ def test_a_lag_that_imitates_a_second_order_takes_no_name() -> None:
     base = based((RINGING,), 1)
     state = with_effect(base, SensorLag(), 0.5)
     assert state.optimum.cost < base.start.optimum.cost - 50.0  # the lag would be named
-    assert "2 and 1" in integer_dynamics(state, base.problem)
+    found = integer_dynamics(state, base.problem)
+    assert found is not None
+    assert "2 and 1" in found.said
+    assert not found.astray
 
 
 def test_a_lag_behind_a_fractional_plant_keeps_its_name() -> None:
     """No integer orders follow it."""
     base = based((SLOW,), 1)
     state = with_effect(base, SensorLag(), 0.5)
-    assert integer_dynamics(state, base.problem) == ""
+    assert integer_dynamics(state, base.problem) is None
 
 
 def test_nonlinear_effects_keep_their_names() -> None:
     """Integer orders stand in for linear dynamics alone."""
     base = based((RINGING,), 1)
-    assert integer_dynamics(with_effect(base, EvenCurvature(), 0.01), base.problem) == ""
-    assert integer_dynamics(base.start, base.problem) == ""
+    assert integer_dynamics(with_effect(base, EvenCurvature(), 0.01), base.problem) is None
+    assert integer_dynamics(base.start, base.problem) is None
+
+
+def test_integer_orders_are_held_against_unseen_records() -> None:
+    """Those of a plant that is another one there are off by what both plants differ in."""
+    base = based((RINGING,), 2)
+    slower = record("held", (TransferPath.of_times(1.0, 0.4, (2.2, 1.6), (2.0, 1.0)),), 9)
+    own, other = (
+        replace(base.problem, study=replace(base.problem.study, held_out=(one,)))
+        for one in (record("held", (RINGING,), 9), slower)
+    )
+    same, off = (integer_plant(base.start, one) for one in (own, other))
+    assert same is not None
+    assert off is not None
+    assert same.unseen == pytest.approx(1.0, abs=0.15)
+    apart = slower.response - record("held", (RINGING,), 9).response
+    assert off.unseen == pytest.approx(np.hypot(1.0, np.sqrt(np.mean(apart**2)) / NOISE), rel=0.15)
 
 
 def test_an_order_with_a_stated_prior_stays() -> None:

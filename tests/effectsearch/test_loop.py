@@ -24,7 +24,7 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import log_scores, risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
-from lcopa_bayes.effectsearch.verdict import COVERED, Findings, Miss, decide
+from lcopa_bayes.effectsearch.verdict import COVERED, Dynamics, Findings, Miss, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -370,6 +370,14 @@ def test_an_alarm_of_the_trace_must_hold_against_the_refit():
     assert not alarmed(3.19)
     assert alarmed(3.19, ("b", 3.21, False))
     assert not alarmed(3.19, ("b", 9.0, True))  # noise that is not normal changes no response
+
+
+@pytest.mark.parametrize(("unseen", "confidence"), [(np.nan, "firm"), (1.09, "firm"), (1.32, "tentative")])
+def test_linear_dynamics_that_miss_unseen_records_are_not_all_that_is_missing(unseen, confidence):
+    linear = Dynamics("elements of integer orders (2 and 1) follow the records as well", unseen)
+    verdict = decide(replace(FOUND, linear=linear))
+    assert (verdict.kind, verdict.confidence) == ("unexplained", confidence)
+    assert ("1.32 times that on unseen ones" in verdict.sentence) == (confidence == "tentative")
 
 
 def test_why_nothing_is_named_is_said():

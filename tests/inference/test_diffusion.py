@@ -13,7 +13,8 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.diffusion import KINDS, Kind, diffused, rises, series
-from lcopa_bayes.inference.lagsum import best_of, lag_fits, lag_problem
+from lcopa_bayes.inference.lagfits import best_of, lag_fits
+from lcopa_bayes.inference.lagsum import lag_problem
 
 SD, GAIN, TIME, DELAY = 0.01, 1.2, 3.0, 0.43
 SLAB = {"wall": lambda p: 1 / np.cosh(np.sqrt(p)), "layer": lambda p: np.tanh(np.sqrt(p)) / np.sqrt(p)}

@@ -14,7 +14,8 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.lagsum import WEIGHT, LagTable, lag_fits, lag_problem, lag_table
+from lcopa_bayes.inference.lagfits import lag_fits
+from lcopa_bayes.inference.lagsum import WEIGHT, LagTable, lag_problem, lag_table
 
 SD = 0.01
 GAINS, TIMES, DELAY = (0.7, 0.5), (0.6, 3.0), 0.43
@@ -185,3 +186,22 @@ def test_least_squares_of_two_paths_leave_no_more_than_what_made_the_records(
     truth = np.array([*np.log(first), *np.log(second), early, late])
     square = float((table.residuals(truth[None]) ** 2).sum()) + table.remainder
     assert lag_fits(table)[1].square <= square + 0.1
+
+
+def test_samples_may_lie_anywhere_along_what_they_are_open_to() -> None:
+    """The response to a shorter lag, say, in any amount: the likelihood is the same, and without it not."""
+    study = made()
+    noise, delays = np.array([SD]), np.linspace(0.2, 0.7, 9)[None]
+    along = [lags(one.time, (1.0,), (0.2,), 0.1) for one in study.fit]
+    problem = lag_problem(study)
+    moved = []
+    for samples, each in zip(problem.posterior.samples, along, strict=True):
+        (axis,) = samples.axes
+        moved.append(replace(samples, axes=(replace(axis, values=axis.values + 0.3 * each),)))
+    other = replace(problem, posterior=replace(problem.posterior, samples=tuple(moved)))
+    open_to = tuple(each[None] for each in along)
+    coordinates = np.array([[*np.log(TIMES), DELAY], [0.0, 1.0, 0.5]])
+    one, two = (lag_table(each, 0, [0], noise, delays, open_to) for each in (problem, other))
+    assert two.log_density(coordinates) == pytest.approx(one.log_density(coordinates), abs=1e-6)
+    closed = lag_table(other, 0, [0], noise, delays)
+    assert np.abs(closed.log_density(coordinates) - one.log_density(coordinates)).min() > 1.0

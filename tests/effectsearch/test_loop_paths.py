@@ -1,0 +1,123 @@
+"""Sums of lags for one path beside another that rings, which no sum of lags for both can follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from effectsearch.test_integerplants import record
+from scipy.optimize import least_squares
+
+from lcopa_bayes.bench.inversion import unit_step
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
+from lcopa_bayes.effectsearch.lags import figures_with_lags, fitted_plant, lags_of, linear_dynamics
+from lcopa_bayes.effectsearch.openeffects import step_figures
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.results.sumsoflags import Alternative, lags_beside, sentence_of
+
+RING = TransferPath.of_times(1.0, 0.4, (2.0, 0.8), (2.0, 1.0))
+"""Second order, damping 0.2."""
+WEIGHTS, TIMES, DELAY = (0.5, 0.4), (0.3, 4.0), 0.2
+"""Of a path of two lags a decade apart, which no single fractional term is."""
+
+
+def lags(since: Vector, weights: tuple[float, ...], times: tuple[float, ...]) -> Vector:
+    """Response of parallel lags to a unit step."""
+    after = np.maximum(since, 0.0)
+    return np.asarray(
+        -np.sum([w * np.expm1(-after / t) for w, t in zip(weights, times, strict=True)], axis=0)
+    )
+
+
+def rung(since: Vector, path: TransferPath) -> Vector:
+    """Response of a resonance to a unit step."""
+    return np.where(since > 0, path.gain * unit_step(path, np.maximum(since, 1e-9)), 0.0)
+
+
+def steps(one: Record, drive: int) -> list[tuple[float, float]]:
+    """Times and sizes of the changes of a drive."""
+    jumps = np.diff(one.drive[:, drive], prepend=one.drive[0, drive])
+    return [(float(one.time[k]), float(jumps[k])) for k in np.flatnonzero(jumps)]
+
+
+def mixed(seed: int) -> Record:
+    """The second drive acts through lags in place of the resonance that `record` gives it."""
+    one = record(f"run{seed}", (RING, replace(RING, gain=0.0)), seed)
+    read = one.response[:, 0].copy()
+    for at, size in steps(one, 1):
+        read += size * lags(one.time - at - DELAY, WEIGHTS, TIMES)
+    return replace(one, response=read[:, None])
+
+
+@cache
+def based() -> Base:
+    model = ModelSettings(terms={"y_u1": 2, "y_u2": 1}, share="none", delay="path")
+    study = Study("mixed", None, "s", 3, (mixed(5), mixed(6)), (), model)
+    return fitted_base(study, (), as_stated=True, draws=100)
+
+
+@cache
+def found() -> tuple[Alternative, ...]:
+    return lags_of(based().start, based().problem)
+
+
+def test_the_path_that_is_no_element_has_lags_and_the_one_that_rings_none():
+    (one,) = found()
+    assert [path.name for path in one.paths] == ["y_u2"]
+    assert [path.name for path in one.beside] == ["y_u1"]
+    assert one.support == "lags"
+    assert one.search.best.lags == len(TIMES)
+    for values, true in ((one.draws.gains[:, 0], sum(WEIGHTS)), (one.draws.delays[:, 0], DELAY)):
+        low, high = np.quantile(values, (0.005, 0.995))
+        assert low <= true <= high
+    assert "y_u2, beside the other paths as they are fitted, follow" in sentence_of([one])
+
+
+def test_lags_for_all_paths_do_not_follow():
+    plant = fitted_plant(based().start, based().problem)
+    (every,) = lags_beside(plant, single=False)
+    assert every.support == "plant"
+    assert every.beside == ()
+
+
+def test_the_square_beside_other_paths_is_that_of_a_joint_fit():
+    """Second method: the closed forms of both paths, fitted together under the noise that the loop has. The
+    other path moves along its slopes where the plant has it, which the lags push off by some deviations."""
+    (one,) = found()
+    records, sd = based().problem.study.fit, float(based().start.whitening.noise[0].sd)
+
+    def residual(x: Vector) -> Vector:
+        gain, inertia, drag, late, first, second, fast, slow, delay, *offsets = x
+        ring = TransferPath.of_times(gain, 0.0, (inertia, drag), (2.0, 1.0))
+        out = []
+        for each, offset in zip(records, offsets, strict=True):
+            read = each.response[:, 0] - offset
+            for at, size in steps(each, 0):
+                read = read - size * rung(each.time - at - late, ring)
+            for at, size in steps(each, 1):
+                read = read - size * lags(each.time - at - delay, (first, second), (fast, slow))
+            out.append(read / sd)
+        return np.concatenate(out)
+
+    joint = least_squares(residual, [1.0, 2.0, 0.8, 0.4, *WEIGHTS, *TIMES, DELAY, 0.02, 0.02], x_scale="jac")
+    assert 0.0 <= one.search.fits[1].square - 2 * joint.cost < 6.0
+    assert one.square - 2 * joint.cost > 100.0
+
+
+def test_figures_of_the_path_are_over_the_lags_and_those_of_the_other_are_not():
+    state, layout = based().start, based().problem.posterior.table.layout
+    own = step_figures(state, [state.optimum.x[None]], np.ones(1), span=20.0, time_unit="s")
+    over = {one.name: one for one in figures_with_lags(own, found(), layout, span=20.0, time_unit="s")}
+    assert len(over["steady_state[y_u2]"].parts) == 2
+    assert len(over["steady_state[y_u1]"].parts) == 1
+
+
+def test_linear_dynamics_of_one_path_are_named_as_such():
+    dynamics = linear_dynamics(based().start, found(), based().fit.noise_samples)
+    assert dynamics is not None
+    assert "lags follow y_u2" in dynamics.said
