@@ -108,7 +108,7 @@ SHAPES: Mapping[str, Shape] = {
     "1x2": Shape(responses=1, drives=2, records=3),
     "2x1, jittered clock": Shape(responses=2, jitter=0.8),
     "2x2, held out": Shape(responses=2, drives=2, records=4),
-    "3x2, dark record": Shape(responses=3, drives=2, dark=True),
+    "3x2, dark record": Shape(responses=3, drives=2, samples=40, dark=True),
     "no sample at rest": Shape(early=True),
     "one record": Shape(records=1),
     "repeats": Shape(records=4),

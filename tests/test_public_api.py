@@ -419,6 +419,7 @@ print(fit.draws.sha256)
 """Without a main guard."""
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_fits(tmp_path):
     save_record(ON, tmp_path / "on.csv")
     script = tmp_path / "script.py"

@@ -118,6 +118,7 @@ APART = Device(
 )
 
 
+@pytest.mark.slow
 def test_a_plant_of_separate_paths_at_rest_is_not_said_to_have_begun_elsewhere():
     """Before the first change of a drive it rests; paths that share too much make it look otherwise."""
     command = joint(on_off(40.0, hold=60.0, at=10.2, rest=20.0), on_off(3.0, hold=60.0, at=40.2, rest=1.0))

@@ -89,6 +89,7 @@ def test_a_structure_that_is_stated_stays_alone():
     assert found.lags == ()
 
 
+@pytest.mark.slow
 def test_what_a_nonlinear_effect_adds_is_taken_off_first():
     found = loop(study_of(TIMES[:1], LIMIT), library=LIBRARY, sample=False, quick=True)
     assert found.names == ("clipping",)

@@ -151,6 +151,7 @@ def saturated() -> Study:
     return Study("saturated", None, "us", 0, (record,), model=ModelSettings(terms=1))
 
 
+@pytest.mark.slow
 def test_more_than_the_whole_of_an_effect_is_no_name(monkeypatch):
     """Steps of the drive 2.7 times as uneven as its grey levels would make them follow any three levels."""
     assert "grey_quantisation" not in loop(saturated(), sample=False, quick=True).names

@@ -149,6 +149,7 @@ def test_fixed_orders_leave_nothing_to_choose() -> None:
     assert Study(fit=[record()], model={"orders": [2.0, 1.0]}).model.terms == 2
 
 
+@pytest.mark.slow
 def test_a_fit_says_what_was_chosen_of_what(tmp_path: Path) -> None:
     campaign = replace(steps(LAGS), sampler=study(record(), sampler=QUICK).sampler)
     fitted = fit(campaign, folder=tmp_path)

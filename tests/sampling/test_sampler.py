@@ -168,6 +168,7 @@ def test_steps_are_rounded_up_to_whole_rounds_and_at_least_two():
     assert sample(POSTERIOR, plan(steps=2 * ROUND + 1, thin=1)).ensembles[0].steps == 3 * ROUND
 
 
+@pytest.mark.slow
 def test_sampling_stops_once_the_target_is_reached():
     run = sample(POSTERIOR, plan(ensembles=4, steps=5000, thin=3, walkers=16, target_ess=100))
     assert run.ensembles[0].steps < 5000

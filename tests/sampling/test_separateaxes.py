@@ -129,6 +129,7 @@ def test_a_killed_run_goes_on_from_the_axes_it_has(
         sample(whole, plan(), chain_file=tmp_path / "chain.h5", fingerprint="other", resume=True)
 
 
+@pytest.mark.slow
 def test_ensembles_of_an_axis_stand_beside_the_draws_of_another(
     whole: Posterior, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

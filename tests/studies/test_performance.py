@@ -451,6 +451,7 @@ def test_plants_are_counted_however_a_response_is_called():
                 )
 
 
+@pytest.mark.slow
 def test_growth_is_measured_in_processes_of_their_own_and_drawn(tmp_path, capsys):
     rows = growth.measured(["response", "csv", "quick fit"], [1000], 300.0)
     late = growth.measured(["response"], [2000], 0.1)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +139,7 @@ def test_a_killed_run_resumes_to_the_same_draws(record, tmp_path):
     assert main([*words, str(whole)]) == 0
     killed = subprocess.Popen([sys.executable, "-c", script, *words, str(cut)])
     while not (cut / "chain.h5").exists() and killed.poll() is None:
-        pass
+        time.sleep(0.01)
     killed.kill()
     killed.wait()
     assert (cut / "chain.h5").exists()

@@ -66,6 +66,7 @@ def test_a_climb_with_the_effect_held_is_a_profile(stiff: tuple[Problem, np.ndar
     assert apart[0] == pytest.approx(apart[1], rel=0.5)
 
 
+@pytest.mark.slow
 def test_profiles_by_a_surrogate_are_those_of_the_posterior(
     stiff: tuple[Problem, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ):

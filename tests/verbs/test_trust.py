@@ -81,6 +81,7 @@ def test_a_fleet_lists_a_device_that_would_run_code_as_failed(stranger, capsys):
     assert not (stranger / "executed").exists()
 
 
+@pytest.mark.slow
 def test_a_trusted_study_and_its_run_folder(stranger, tmp_path, capsys):
     assert main(["check", str(stranger), "--trust", "--quiet"]) == 0
     assert (stranger / "executed").exists()
