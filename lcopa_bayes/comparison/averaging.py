@@ -20,7 +20,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL
-from lcopa_bayes.results.alternatives import parts_of_sd
+from lcopa_bayes.results.averages import parts_of_sd
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import metrics_of
 from lcopa_bayes.sampling.convergence import Grade

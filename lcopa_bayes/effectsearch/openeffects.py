@@ -17,7 +17,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.effectsearch.drawsabout import normal_draws
@@ -30,7 +30,7 @@ from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
-from lcopa_bayes.results.alternatives import parts_of_sd
+from lcopa_bayes.results.averages import parts_of_sd, pooled
 from lcopa_bayes.results.steps import curves_of, metrics_of
 
 LEAST = 3e-3
@@ -116,19 +116,6 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
             parts.append(drawn[inside])
             weights.append(one.weight * float(inside.mean()))
     return parts, np.array(weights) / sum(weights)
-
-
-def pooled(values: Sequence[Vector], weights: Vector) -> Vector:
-    """Equally probable values of a mixture whose parts are given by equally probable values, perhaps
-    infinite."""
-    counts = np.round(_DRAWS * weights).astype(int)
-    pairs = zip(values, counts, strict=True)
-    return np.concatenate([_spread(one, (np.arange(n) + 0.5) / n) for one, n in pairs if n])
-
-
-def _spread(values: Vector, places: Array) -> Vector:
-    method = "linear" if np.isfinite(values).all() else "higher"
-    return np.asarray(np.quantile(values, places, method=method))  # type: ignore[call-overload]
 
 
 @final

@@ -4,7 +4,7 @@ orders."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Self, final
 
 from lcopa_bayes.core.wording import listed
@@ -15,7 +15,7 @@ from lcopa_bayes.effectsearch.richerplants import WEIGHT, RicherPlants
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.results.sumsoflags import Alternative
+from lcopa_bayes.results.sumsoflags import Alternative, held_against
 
 
 @final
@@ -53,16 +53,8 @@ class PlantsBeside:
         response better by Akaike's criterion."""
         if self.integer is None or not lags:
             return tuple(lags)
-        plants = [fitted_plant(state, problem) for state in (chosen, self.integer.plant.state)]
-
-        def worse(one: Alternative) -> float:
-            """What the chosen plant lacks on a response."""
-            axis = one.search.axis
-            paths = (*one.paths, *one.beside)
-            own, integer = (plant.square(axis) + 2 * plant.parameters(paths) for plant in plants)
-            return max(own - integer, 0.0)
-
-        return tuple(replace(one, advantage=one.advantage - worse(one)) for one in lags)
+        integer = fitted_plant(self.integer.plant.state, problem)
+        return held_against(lags, fitted_plant(chosen, problem), integer)
 
     @property
     def shares(self) -> tuple[tuple[str, float], ...]:

@@ -1,11 +1,12 @@
-"""Numbers over structures: what the fitted plant and sums of lags leave open together.
+"""Numbers over structures: what the fitted plant, integer orders and sums of lags leave open together.
 
 A plant of Kelvin elements with its structure chosen is one family; the records may be followed as well by
 others, whose steady values and delays are elsewhere though both leave the same residual. Sums of lags
-(`inference.lagsum`) stand for these. Where Akaike's criterion leaves both any support, each counts one half,
-whatever the evidence says: it rewards the family that needs fewer parameters, not the one that is true
-(Burnham and Anderson 2002, Model Selection and Multimodel Inference, sect. 2.6). Bands of records are those
-of the fitted plant.
+(`inference.lagsum`) stand for these, and the corner of the family itself where orders are integers has its
+part by evidence (`inference.integerorders`). Where Akaike's criterion leaves plant and lags any support, each
+counts one half, whatever the evidence says: it rewards the family that needs fewer parameters, not the one
+that is true (Burnham and Anderson 2002, Model Selection and Multimodel Inference, sect. 2.6). Bands of
+records are those of the fitted plant.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quanti
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.results.averages import parts_of_sd, pooled
 from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.integerfit import IntegerFit, integer_fit
 from lcopa_bayes.results.steps import Metric, metrics_of
 from lcopa_bayes.results.sumsoflags import (
     Alternative,
     FittedPlant,
+    held_against,
     lag_figures,
     lags_beside,
     sentence_of,
@@ -42,18 +46,35 @@ _SHOWN = 4
 """Most numbers named in a sentence."""
 
 
+_SAID = {"plant": "the fitted plant", "integer": "integer orders", "lags": "sums of lags"}
+"""What the parts of a number are."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Averaged:
-    """One number over both plants."""
+    """One number over several plants."""
 
     estimate: Estimate
-    plant: Vector
-    """At draws of the fitted plant, (draws,) [unit]."""
-    lags: Vector
-    """At draws of the sums of lags, (draws,) [unit]."""
-    weight: float
-    """Of the sums of lags [-]."""
+    parts: Mapping[str, Vector]
+    """At draws of the fitted plant and of what else it is over, by their keys in `_SAID`, (draws,) [unit]."""
+    shares: Mapping[str, float]
+    """Of the parts; they add up to 1 [-]."""
+
+    @property
+    def plant(self) -> Vector:
+        """At draws of the fitted plant, (draws,) [unit]."""
+        return self.parts["plant"]
+
+    @property
+    def open(self) -> bool:
+        """Whether the fitted plant is one of several that it is over."""
+        return 0.0 < self.shares["plant"] < 1.0
+
+    @property
+    def others(self) -> str:
+        """What it is over beside the fitted plant."""
+        return " and ".join(_SAID[one] for one in self.parts if one != "plant" and self.shares[one])
 
     @property
     def moved(self) -> bool:
@@ -69,25 +90,29 @@ class Averaged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values: the estimate, its parts, and what each plant says by itself."""
-        alone = {"plant": _ends_and_median(self.plant), "lags": _ends_and_median(self.lags)}
-        noise, structure = parts_of_sd([self.plant, self.lags], np.array([1 - self.weight, self.weight]))
-        return self.estimate.as_json() | alone | {"sd_noise": noise, "sd_structure": structure}
+        alone = {one: _ends_and_median(self.parts[one]) if one in self.parts else None for one in _SAID}
+        shares = np.array([self.shares[one] for one in self.parts])
+        noise, structure = parts_of_sd(list(self.parts.values()), shares)
+        parts = {"shares": dict(self.shares), "sd_noise": noise, "sd_structure": structure}
+        return self.estimate.as_json() | alone | parts
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Alternatives:
-    """Sums of lags beside a fitted plant, and the numbers that both have."""
+    """Sums of lags and integer orders beside a fitted plant, and the numbers that all have."""
 
     alternatives: tuple[Alternative, ...]
     """Of every response axis that has any."""
     numbers: tuple[Averaged, ...]
-    """Figures of the step responses that the sums of lags have a part in."""
+    """Figures of the step responses that others than the fitted plant have a part in."""
+    integer: IntegerFit | None = None
 
     @property
     def sentence(self) -> str:
         """Which plants the records leave in question."""
-        return sentence_of(self.alternatives)
+        integer = [self.integer.sentence] if self.integer else []
+        return " ".join([*integer, sentence_of(self.alternatives)]).strip()
 
     def limitations(self, names: Mapping[str, tuple[str, ...]]) -> list[Limitation]:
         """What this says of the parameters of the fitted plant, by the figure each of them is: `names` has
@@ -105,15 +130,15 @@ class Alternatives:
                         "weigh other structures",
                     )
                 )
-        moved = [one.estimate for one in self.numbers if one.weight == 0.5 and one.moved]
-        moved = [one for one in moved if one.name in names]
-        if moved:
-            said = [f"{one.name} at {one.lower:.3g} to {one.upper:.3g} {one.unit}" for one in moved]
-            concerned = dict.fromkeys(parameter for one in moved for parameter in names[one.name])
+        moved = [one for one in self.numbers if one.open and one.moved and one.estimate.name in names]
+        for others in dict.fromkeys(one.others for one in moved):
+            own = [one.estimate for one in moved if one.others == others]
+            said = [f"{one.name} at {one.lower:.3g} to {one.upper:.3g} {one.unit}" for one in own]
+            concerned = dict.fromkeys(parameter for one in own for parameter in names[one.name])
             out.append(
                 Limitation(
                     "tentative",
-                    f"sums of lags follow the records as well and leave {listed(said, _SHOWN)}",
+                    f"{others} follow the records as well and leave {listed(said, _SHOWN)}",
                     "record until the response settles, and sample its onset",
                     tuple(concerned),
                 )
@@ -125,6 +150,7 @@ class Alternatives:
         return plain(
             {
                 "sums_of_lags": [one.as_json() | {"ess": one.ess} for one in self.alternatives],
+                "integer_orders": self.integer.as_json() if self.integer else None,
                 "numbers": [one.as_json() for one in self.numbers],
                 "sentence": self.sentence,
             }
@@ -136,24 +162,31 @@ def alternatives_of(
 ) -> tuple[Alternative, ...]:
     """Sums of lags of these kinds beside a fit, perhaps for `single` paths; none where its noise is not
     normal, its plant has effects, or `lags_beside` has none."""
+    plant = _plant(fitted)
+    return lags_beside(plant, kinds, single=single) if plant else ()
+
+
+def _plant(fitted: Fit) -> FittedPlant | None:
+    """At the best of its draws; None of one that sums of lags are not held against."""
     posterior, draws = fitted.problem.posterior, fitted.draws
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
-        return ()
+        return None
     best = draws.flat[[int(draws.log_density.argmax())]]
     best = posterior.complete(posterior.coordinates(best), None)
     axes = range(len(posterior.table.layout.responses))
     noise = tuple(posterior.noise_parameters(best, axis)[0] for axis in axes)
-    seed = fitted.run.plan.seed
-    plant = FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed)
-    return lags_beside(plant, kinds, single=single)
+    return FittedPlant(fitted.problem, best[0], noise, fitted.curves, fitted.run.plan.seed)
 
 
-def with_alternatives(fitted: Fit) -> Fit:
-    """A fit with the figures of its step responses over both plants, and what follows for its grade."""
-    found = alternatives_of(fitted)
-    if not found:
+def with_alternatives(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> Fit:
+    """A fit with the figures of its step responses over all plants, and what follows for its grade."""
+    found, integer = alternatives_of(fitted), integer_fit(fitted, jobs=jobs, quick=quick)
+    if not found and integer is None:
         return fitted
-    other = Alternatives(found, tuple(_numbers(fitted, found)))
+    own, other = _plant(fitted), _plant(integer.draws) if integer else None
+    if own and other:
+        found = held_against(found, own, replace(other, noise=own.noise))
+    over = Alternatives(found, tuple(_numbers(fitted, found, integer)), integer)
     table = fitted.draws.table
     names = {}
     for one in table.layout.paths:
@@ -161,63 +194,55 @@ def with_alternatives(fitted: Fit) -> Fit:
         names[f"steady_state[{one.name}]"] = (table.names[table.at("gain", one.response, one.drive)],)
         names[f"delay[{one.name}]"] = (table.names[slot],)
     free = {name for row, name in zip(table.rows, table.names, strict=True) if row.free}
-    own = {key: value for key, value in names.items() if set(value) <= free}
-    by_name = {number.estimate.name: number.estimate for number in other.numbers}
+    stated = {key: value for key, value in names.items() if set(value) <= free}
+    by_name = {number.estimate.name: number.estimate for number in over.numbers}
     return replace(
         fitted,
-        draws=fitted.draws.limited(other.limitations(own)),
+        draws=fitted.draws.limited(over.limitations(stated)),
         metrics=tuple(by_name.get(one.name, one) for one in fitted.metrics),
-        alternatives=other,
+        alternatives=over,
     )
 
 
-def parts_of_sd(values: Sequence[Vector], weights: Vector) -> tuple[float, float]:
-    """Standard deviation within and between the components of a mixture, each given by equally probable
-    values; NaN where a component with a weight is open. Their squares add up to the mixture's variance."""
-    kept = [(one, weight) for one, weight in zip(values, weights, strict=True) if weight > 0]
-    if not all(np.isfinite(one).all() for one, _ in kept):
-        return np.nan, np.nan
-    share = np.array([weight for _, weight in kept])
-    means = np.array([one.mean() for one, _ in kept])
-    within = float(share @ np.array([one.var() for one, _ in kept]))
-    between = float(share @ (means - share @ means) ** 2)
-    return float(np.sqrt(within)), float(np.sqrt(between))
-
-
-def _numbers(fitted: Fit, found: Sequence[Alternative]) -> list[Averaged]:
-    """Every figure of the step responses that sums of lags have a part in, over both plants."""
+def _numbers(fitted: Fit, found: Sequence[Alternative], integer: IntegerFit | None) -> list[Averaged]:
+    """Every figure of the step responses that another plant has a part in, over all plants."""
     table, unit = fitted.draws.table, fitted.study.time_unit
     weight_of = weights_of(table.layout, found)
     found = [one for one in found if one.support != "plant"]
-    if not found:
-        return []
-    own = metrics_of(table, fitted.curves, time_unit=unit)
-    other = {one.name: one for one in lag_figures(found, fitted.curves.time, unit)}
-    ess = min(fitted.draws.ess, *(one.draws.ess for one in found))
-    grade = fitted.draws.grade.level if ess >= TENTATIVE_ESS else "tentative"
+    values, ess = {"plant": metrics_of(table, fitted.curves, time_unit=unit)}, [fitted.draws.ess]
+    if integer is not None:
+        own = integer.draws
+        values["integer"] = metrics_of(own.draws.table, own.curves, time_unit=unit)
+        ess.append(own.draws.ess)
+    if found:
+        values["lags"] = lag_figures(found, fitted.curves.time, unit)
+        ess += [one.draws.ess for one in found]
+    grade = fitted.draws.grade.level if min(ess) >= TENTATIVE_ESS else "tentative"
+    share = integer.weight if integer else 0.0
+    named = {kind: {one.name: one for one in own} for kind, own in values.items()}
     out = []
-    for one in own:
-        if one.name not in other:
-            continue
-        weight = weight_in(one.name, weight_of)
-        if weight > 0:
-            out.append(_averaged(one, other[one.name], weight, ess, grade))
+    for name, one in named["plant"].items():
+        lags = weight_in(name, weight_of) if name in named.get("lags", {}) else 0.0
+        shares = {"plant": (1 - lags) * (1 - share), "integer": (1 - lags) * share, "lags": lags}
+        parts = {kind: own[name] for kind, own in named.items() if name in own}
+        parts = {kind: own for kind, own in parts.items() if kind == "plant" or shares[kind]}
+        if len(parts) > 1:
+            held = {kind: shares[kind] for kind in parts}
+            out.append(_averaged(one, parts, held, min(ess), grade))
     return out
 
 
-def _averaged(plant: Metric, lags: Metric, weight: float, ess: float, grade: str) -> Averaged:
-    count = min(plant.values.size, lags.values.size)
-    ours, theirs = (
-        one.values[np.linspace(0, one.values.size - 1, count).astype(int)] for one in (plant, lags)
+def _averaged(
+    plant: Metric, parts: Mapping[str, Metric], shares: Mapping[str, float], ess: float, grade: str
+) -> Averaged:
+    values = {kind: one.values for kind, one in parts.items()}
+    *over, last = (_SAID[kind] for kind in parts if shares[kind])
+    notes = [f"of {_SAID[kind]} {one.note}" for kind, one in parts.items() if shares[kind] and one.note]
+    note = "; ".join([f"over {', '.join(over)} and {last}" if over else f"of {last}", *notes])
+    shown = pooled(list(values.values()), np.array([shares[kind] for kind in parts]))
+    return Averaged(
+        Estimate.of(plant.name, plant.unit, shown, ess=ess, grade=grade, note=note), values, shares
     )
-    pooled = theirs if weight == 1.0 else np.concatenate([ours, theirs])
-    own = f"of the fitted plant {plant.note}" if plant.note else ""
-    notes = (
-        ("of sums of lags", lags.note) if weight == 1.0 else ("over the fitted plant and sums of lags", own)
-    )
-    joined = "; ".join(note for note in notes if note)
-    here = Estimate.of(plant.name, plant.unit, pooled, ess=ess, grade=grade, note=joined)
-    return Averaged(here, plant.values, lags.values, weight)
 
 
 def _ends_and_median(values: Vector) -> tuple[float, float, float]:

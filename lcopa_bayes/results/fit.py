@@ -84,7 +84,7 @@ class Fit(Predictive):
     structure: Structure | None = None
     """What other structures the records allow; None where the study states its terms."""
     alternatives: Alternatives | None = None
-    """Sums of lags that follow the records too, and the numbers over both; None likewise."""
+    """Sums of lags and integer orders that follow the records too, and numbers over all; None likewise."""
 
     @property
     def near(self) -> Posterior:

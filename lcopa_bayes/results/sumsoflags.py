@@ -172,6 +172,21 @@ def lags_beside(
     return tuple(out)
 
 
+def held_against(
+    found: Sequence[Alternative], chosen: FittedPlant, other: FittedPlant
+) -> tuple[Alternative, ...]:
+    """Sums of lags beside a chosen plant, held against another one where that follows a response better by
+    Akaike's criterion."""
+
+    def worse(one: Alternative) -> float:
+        """What the chosen plant lacks on a response."""
+        paths, axis = (*one.paths, *one.beside), one.search.axis
+        own, others = (plant.square(axis) + 2 * plant.parameters(paths) for plant in (chosen, other))
+        return max(own - others, 0.0)
+
+    return tuple(replace(one, advantage=one.advantage - worse(one)) for one in found)
+
+
 def sentence_of(found: Sequence[Alternative]) -> str:
     """Which plants the records leave in question."""
     figures = "figures of the step responses are"

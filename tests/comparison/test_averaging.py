@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from lcopa_bayes.comparison.averaging import _moved, averaged, mixture_quantiles, parts_of_sd
+from lcopa_bayes.comparison.averaging import _moved, averaged, mixture_quantiles
+from lcopa_bayes.results.averages import parts_of_sd
 
 AT = (np.arange(200) + 0.5) / 200
 

@@ -13,13 +13,13 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, loop
-from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds, pooled
+from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.model.effects.commands import OverdrivePulse
 from lcopa_bayes.model.effects.sensor import SensorLag
-from lcopa_bayes.results.alternatives import parts_of_sd
+from lcopa_bayes.results.averages import parts_of_sd, pooled
 
 DELAY, FRAME, SD = 3.0, 2.0, 0.02
 

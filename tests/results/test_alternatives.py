@@ -12,7 +12,8 @@ from small import record, study
 
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.results.alternatives import Alternatives, alternatives_of, parts_of_sd, with_alternatives
+from lcopa_bayes.results.alternatives import Alternatives, alternatives_of, with_alternatives
+from lcopa_bayes.results.averages import parts_of_sd
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.verbs.fit import fit
@@ -109,7 +110,8 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
         return
     assert one.support == "both"
     number = {number.estimate.name: number for number in other.numbers}["steady_state[y]"]
-    ours, theirs = number.plant, number.lags
+    ours, theirs = number.parts["plant"], number.parts["lags"]
+    assert number.shares == {"plant": 0.5, "lags": 0.5}
     pooled = np.concatenate([np.repeat(ours, theirs.size), np.repeat(theirs, ours.size)])
     assert number.estimate.lower == pytest.approx(float(np.quantile(pooled, 0.05)), rel=0.02)
     noise, structure = parts_of_sd([number.plant, number.lags], np.array([0.5, 0.5]))

@@ -1,0 +1,120 @@
+"""A fitted plant with the orders of some elements at integers, as likely as the one with free orders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.integerorders import (
+    Orders,
+    most_likely,
+    nearest,
+    said_of,
+    starts,
+    weight_of,
+    with_orders,
+)
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.results.fit import Fit, fit
+
+_PART = 0.02
+"""Share of the draws below which integer orders have no part: they would move an end of a 90 % interval by no
+more than that share of the draws."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class IntegerFit:
+    """A plant with integer orders beside a fit, under the noise of that."""
+
+    orders: Orders
+    problem: Problem
+    """The study with these orders."""
+    values: Vector
+    """Table values at its optimum, (rows,)."""
+    gained: float
+    """Log likelihood over that of the fitted plant, both at their optima [nat]."""
+    log_odds: float
+    """By the Bayesian information criterion, against the fitted plant [nat]."""
+    sampled: Fit | None = None
+    """Its posterior; None before it is sampled."""
+
+    @property
+    def weight(self) -> float:
+        """Its part beside the fitted plant [-]."""
+        return weight_of(self.log_odds, self.gained)
+
+    @property
+    def draws(self) -> Fit:
+        """Its posterior, once it is sampled."""
+        assert self.sampled is not None
+        return self.sampled
+
+    @property
+    def sentence(self) -> str:
+        """What it is and what part it has."""
+        return (
+            f"A plant with integer orders ({said_of(self.orders)}; {self.log_odds:+.1f} nat by BIC) follows "
+            f"the records as well and has {100 * self.weight:.0f} % of the draws of both."
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "orders": {name: list(own) for name, own in self.orders.items()},
+            "weight": self.weight,
+            "log_odds": self.log_odds,
+            "log_likelihood_gained": self.gained,
+            "ess": self.draws.draws.ess,
+            "grade": self.draws.draws.grade.level,
+        }
+
+
+def integer_fit(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> IntegerFit | None:
+    """The plant of a fit with integer orders of all elements that the records let have them, sampled as that
+    was; None without any, or where its plant has effects."""
+    posterior, draws = fitted.problem.posterior, fitted.draws
+    if posterior.simulation is not None:
+        return None
+    best = draws.flat[[int(draws.log_density.argmax())]]
+    values = _optimum(posterior, [posterior.complete(posterior.coordinates(best), None)[0]])
+    orders = dict(nearest(posterior.table, values))
+    found = most_likely(orders, lambda own: _held(fitted, values, own))
+    if found is None or found.weight < _PART:
+        return None
+    return replace(found, sampled=fit(found.problem.study, jobs=jobs, quick=quick))
+
+
+def _held(fitted: Fit, values: Vector, orders: Orders) -> IntegerFit | None:
+    """The plant with these elements at integer orders; None where it cannot follow the records."""
+    posterior = fitted.problem.posterior
+    try:
+        problem = problem_of(with_orders(fitted.study, posterior.table, orders))
+        if fitted.problem.refinement > 1:
+            problem = problem.refined(fitted.problem.refinement)
+        own = problem.posterior
+        begun = starts(posterior.table, values, own.table, orders)
+        optimum = _optimum(own, [own.table.canonical(one[None])[0] for one in begun])
+    except (ArithmeticError, InputError):
+        return None
+    fewer = len(LeastSquares(posterior).columns) - len(LeastSquares(own).columns)
+    gained = _likelihood(own, optimum) - _likelihood(posterior, values)
+    saved = 0.5 * fewer * float(np.log(posterior.size))
+    return IntegerFit(orders, problem, optimum, gained, gained + saved)
+
+
+def _optimum(posterior: Posterior, begun: Sequence[Vector]) -> Vector:
+    """The likeliest table values of descents from some under their noise, (rows,)."""
+    found = [LeastSquares(posterior).solve(one)[0] for one in begun]
+    return max(found, key=lambda one: _likelihood(posterior, one))
+
+
+def _likelihood(posterior: Posterior, values: Vector) -> float:
+    return float(posterior.joint_log_likelihood(values[None])[0])
