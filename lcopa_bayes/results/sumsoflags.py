@@ -85,7 +85,7 @@ class Alternative:
     @property
     def said(self) -> str:
         """What they are."""
-        best, most = self.search.best.lags, self.search.lags
+        best, most = self.search.best.lags, self.search.lags[-1]
         if self.search.kind == "lags":
             return f"sums of {best} to {most} lags"
         return f"diffusion {_DIFFUSIONS[self.search.kind]} and up to {most - 1} lag{'s' * (most > 2)}"

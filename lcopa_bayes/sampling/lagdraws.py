@@ -1,9 +1,10 @@
 """Draws of the sums of lags that a response axis may be: times and delays, and exactly their weights.
 
-The number of lags is the best by BIC and one more, which the records need not show: what it leaves open of a
-number is part of that number's interval. A diffusion may stand in place of the first lag of each path, where
-it follows the records as well (`inference.diffusion`). Delays are tabulated over all that is asked first and
-then where they are.
+The number of lags is the best by BIC in half of the draws, and in the others one more, which the records need
+not show: what it leaves open of a number is part of that number's interval. Draws with a spare lag alone
+would not do: most of its prior is at later delays, and an interval over them begins after the true one. A
+diffusion may stand in place of the first lag of each path, where it follows the records as well
+(`inference.diffusion`). Delays are tabulated over all that is asked first and then where they are.
 
 One path has so few coordinates that importance sampling from a mixture holds, which is fitted to the draws of
 all its forerunners; these are fitted to powers of the density that rise to 1, so that ridges are followed to
@@ -119,9 +120,10 @@ class LagSearch:
         return best_of(self.fits)
 
     @property
-    def lags(self) -> int:
-        """Lags of the draws: one more than the best has, where there may be so many."""
-        return min(self.best.lags + 1, MOST)
+    def lags(self) -> tuple[int, ...]:
+        """Numbers of lags of the draws: that of the best and one more, where there may be so many."""
+        best = self.best.lags
+        return (best, best + 1) if best < MOST else (best,)
 
     @property
     def apart(self) -> int:
@@ -171,9 +173,10 @@ class LagMixture:
 
     @classmethod
     def of(cls, searches: Sequence[LagSearch], seed: int) -> LagMixture:
-        """As many draws of each search."""
+        """As many draws of each search, and of each number of lags of one."""
         rng = np.random.default_rng([seed, 1])
-        drawn = [lag_draws(one, seed, _WANTED / len(searches)) for one in searches]
+        every = [(one, lags) for one in searches for lags in one.lags]
+        drawn = [lag_draws(one, lags, seed, _WANTED / len(every)) for one, lags in every]
         sizes = np.array([len(one.delays) for one in drawn])
         each = zip(np.cumsum(sizes) - sizes, sizes, strict=True)
         picked = [first + rng.choice(size, sizes.min(), replace=False) for first, size in each]
@@ -205,15 +208,15 @@ def likely(searches: Sequence[LagSearch]) -> tuple[LagSearch, ...]:
     return tuple(one for one in ranked if one.best.bic < ranked[0].best.bic + _LIKELY)
 
 
-def lag_draws(search: LagSearch, seed: int, wanted: float = _WANTED) -> LagDraws:
-    """Draws about the optima of a search, effectively as many as are `wanted`, tabulated farther out where
-    they stand beside an end."""
-    rng = np.random.default_rng(seed)
-    kept, ess = _sampled(search, rng, wanted)
+def lag_draws(search: LagSearch, lags: int, seed: int, wanted: float = _WANTED) -> LagDraws:
+    """Draws of so many lags about the optima of a search, effectively as many as are `wanted`, tabulated
+    farther out where they stand beside an end."""
+    rng = np.random.default_rng([seed, lags])
+    kept, ess = _sampled(search, lags, rng, wanted)
     wider = _wider(search, kept)
     while (wider != search.near).any():
         search = replace(search, near=wider)
-        kept, ess = _sampled(search, rng, wanted)
+        kept, ess = _sampled(search, lags, rng, wanted)
         wider = _wider(search, kept)
     log_times, own = search.table.parts(kept)
     scales = search.problem.scales
@@ -245,9 +248,9 @@ def _wider(search: LagSearch, draws: Matrix) -> Matrix:
     return np.stack([low, np.where(above, np.minimum(near[:, 1] + width, delays[:, 1]), near[:, 1])], axis=1)
 
 
-def _sampled(search: LagSearch, rng: np.random.Generator, wanted: float) -> tuple[Matrix, float]:
+def _sampled(search: LagSearch, lags: int, rng: np.random.Generator, wanted: float) -> tuple[Matrix, float]:
     """Coordinates of equally probable draws, (draws, dimension), and their effective number."""
-    begun = _begun(search, rng)
+    begun = _begun(search, lags, rng)
     weighted = _weighted(search, begun, rng) if search.table.paths == 1 else None
     return weighted or _walked(search, begun, rng, wanted)
 
@@ -324,9 +327,9 @@ def _ess(table: LagTable, chain: Array) -> float:
     return float(min(stats.ess(values[..., k], chain_axis=0, draw_axis=1) for k in range(values.shape[2])))
 
 
-def _begun(search: LagSearch, rng: np.random.Generator) -> Mixture:
+def _begun(search: LagSearch, lags: int, rng: np.random.Generator) -> Mixture:
     """Components near the optimum of so many lags, and near the best with a spare lag anywhere."""
-    table, best, lags = search.table, search.best, search.lags
+    table, best = search.table, search.best
     low, high = table.ends(lags)
     widest = _LOOSE * (high - low)
     centres, covariances = [search.fits[lags - 1].coordinates], [search.fits[lags - 1].covariance]

@@ -31,8 +31,9 @@ from lcopa_bayes.sampling.lagdraws import (
 ENDS = np.array([[0.0, 1.0]])
 
 
-def drawn(seed: int = 0) -> LagDraws:
-    return lag_draws(searched(seed), seed)
+def drawn(seed: int = 0, spare: int = 1) -> LagDraws:
+    search = searched(seed)
+    return lag_draws(search, search.best.lags + spare, seed)
 
 
 def searched(seed: int = 0, ends: Matrix = ENDS) -> LagSearch:
@@ -47,7 +48,7 @@ def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]
     table = search.table
     assert search.best.lags == 1
     rng = np.random.default_rng(1)
-    draws, ess = sampled(search, _begun(search, rng), rng)
+    draws, ess = sampled(search, _begun(search, 2, rng), rng)
     assert ess >= 160
     low, high = table.ends(2)
     axes = [np.linspace(low[k], high[k], 41)[:-1] + (high[k] - low[k]) / 80 for k in range(3)]
@@ -64,10 +65,12 @@ def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]
         assert own.std() == pytest.approx(sd, rel=0.25)
 
 
-def test_intervals_hold_what_made_the_records() -> None:
+@pytest.mark.parametrize("spare", [0, 1])
+def test_intervals_hold_what_made_the_records(spare: int) -> None:
     held = []
     for seed in range(4):
-        one = drawn(seed)
+        one = drawn(seed, spare)
+        assert one.times.shape[2] == len(GAINS) + spare
         for values, true in (
             (one.gains[:, 0], sum(GAINS)),
             (one.delays[:, 0], DELAY),
@@ -82,14 +85,14 @@ def test_intervals_hold_what_made_the_records() -> None:
 
 
 def test_the_same_seed_gives_the_same_draws() -> None:
-    one, two, other = drawn(1), drawn(1), lag_draws(searched(1), 2)
+    one, two, other = drawn(1), drawn(1), lag_draws(searched(1), 3, 2)
     assert (one.times == two.times).all()
     assert (one.weights == two.weights).all()
     assert not (one.times == other.times).all()
 
 
 def test_a_delay_at_the_end_of_the_first_table_is_followed() -> None:
-    one = lag_draws(searched(ends=np.array([[0.0, 4.0]])), 0)
+    one = lag_draws(searched(ends=np.array([[0.0, 4.0]])), 3, 0)
     assert np.median(one.delays) == pytest.approx(DELAY, abs=0.1)
 
 
@@ -125,14 +128,15 @@ def test_a_wall_is_drawn_where_it_follows_the_records_best() -> None:
     for seed in range(4):
         for one in slab(seed):
             if one.kind in held:
-                low, high = np.quantile(lag_draws(one, seed).delays[:, 0], (0.01, 0.99))
+                low, high = np.quantile(lag_draws(one, one.lags[-1], seed).delays[:, 0], (0.01, 0.99))
                 held[one.kind] += low <= SLAB_DELAY <= high
     assert held["wall"] >= 3  # of 4 at 98 %: fewer once in 400 times
     assert held["lags"] < 3
 
 
 def test_the_response_of_a_wall_is_that_of_its_series_and_lags() -> None:
-    one = lag_draws(slab(0)[1], 0)
+    search = slab(0)[1]
+    one = lag_draws(search, search.lags[-1], 0)
     assert one.kind == "wall"
     time = np.array([0.1, 0.5, 1.0, 10.0, 1e4])
     since = np.maximum(time - one.delays[3, 0], 0.0)
@@ -142,16 +146,17 @@ def test_the_response_of_a_wall_is_that_of_its_series_and_lags() -> None:
     assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-6, abs=1e-6)
 
 
-def test_kinds_have_equal_parts_in_a_mixture() -> None:
+def test_kinds_and_numbers_of_lags_have_equal_parts_in_a_mixture() -> None:
     searches = slab(0)[:2]
     both = LagMixture.of(searches, 3)
-    apart = [lag_draws(one, 3, 100.0) for one in searches]
+    every = [(one, lags) for one in searches for lags in (one.best.lags, one.best.lags + 1)]
+    apart = [lag_draws(one, lags, 3, 50.0) for one, lags in every]
     ends = [set(one.delays[:, 0]) for one in apart]
     counts = [sum(value in own for value in both.delays[:, 0]) for own in ends]
-    assert counts[0] == counts[1] == len(both.delays) / 2
-    assert both.ess == pytest.approx(2 * min(one.ess for one in apart))
+    assert counts == [len(both.delays) / 4] * 4
+    assert both.ess == pytest.approx(4 * min(one.ess for one in apart))
     time = np.array([5.0])
-    source = apart[int(both.delays[0, 0] in ends[1])]
+    source = apart[next(k for k, own in enumerate(ends) if both.delays[0, 0] in own)]
     place = int(np.flatnonzero(source.delays[:, 0] == both.delays[0, 0])[0])
     assert both.response(0, time)[0] == pytest.approx(source.response(0, time)[place])
     assert both.gains[0] == pytest.approx(source.gains[place])
@@ -179,6 +184,6 @@ def test_walkers_of_several_paths_leave_where_they_began() -> None:
     ends = np.array([[0.0, 0.2]] * 2)
     (search,) = LagSearch.over(lag_problem(chains(0)), 0, [0, 1], np.array([0.05]), ends, ["lags"])
     rng = np.random.default_rng(1)
-    draws, ess = _walked(search, _begun(search, rng), rng)
+    draws, ess = _walked(search, _begun(search, search.lags[-1], rng), rng)
     assert draws.shape[1] >= 8
     assert ess >= 200
