@@ -283,9 +283,7 @@ def _looped(
     lags = plants.held_against(lags, searched.state, problem)
     preferred = any(one.support == "lags" for one in lags)
     verdict = decide(replace(findings, linear=dynamics, preferred=preferred))
-    if verdict.kind == "unexplained" and dynamics is None:
-        lags = ()
-    elif verdict.kind == "unexplained" and extended:
+    if verdict.kind == "unexplained" and extended and chosen:
         lags = lags_of(before.state, problem)  # beside the plant without them
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)

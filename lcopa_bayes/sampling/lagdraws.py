@@ -328,18 +328,20 @@ def _ess(table: LagTable, chain: Array) -> float:
 
 
 def _begun(search: LagSearch, lags: int, rng: np.random.Generator) -> Mixture:
-    """Components near the optimum of so many lags, and near the best with a spare lag anywhere."""
-    table, best = search.table, search.best
+    """Components near the optimum of so many lags, and, where the best has fewer, near that of one lag fewer
+    with a spare one anywhere."""
+    table = search.table
     low, high = table.ends(lags)
     widest = _LOOSE * (high - low)
     centres, covariances = [search.fits[lags - 1].coordinates], [search.fits[lags - 1].covariance]
-    if lags > best.lags:
-        spare = np.arange(table.paths) * lags + best.lags
+    if lags > search.best.lags:
+        fewer = search.fits[lags - 2]
+        spare = np.arange(table.paths) * lags + fewer.lags
         own = np.setdiff1d(np.arange(low.size), spare)
         for _ in range(_SPARE):
             centre, covariance = np.empty(low.size), np.diag(widest**2)
-            centre[own], centre[spare] = best.coordinates, rng.uniform(low[spare], high[spare])
-            covariance[np.ix_(own, own)] = best.covariance
+            centre[own], centre[spare] = fewer.coordinates, rng.uniform(low[spare], high[spare])
+            covariance[np.ix_(own, own)] = fewer.covariance
             centres.append(centre)
             covariances.append(covariance)
     means, factors = [], []

@@ -187,3 +187,12 @@ def test_walkers_of_several_paths_leave_where_they_began() -> None:
     draws, ess = _walked(search, _begun(search, search.lags[-1], rng), rng)
     assert draws.shape[1] >= 8
     assert ess >= 200
+
+
+def test_more_lags_than_the_best_and_one_are_begun_too() -> None:
+    """Tabulated elsewhere a search may have another best than the one that a number of lags was asked for."""
+    search = searched()
+    for lags in range(1, 5):
+        begun = _begun(search, lags, np.random.default_rng(0))
+        assert begun.dimension == lags + 1
+        assert (begun.draw(50, np.random.default_rng(1))[:, :-1] < 30.0).all()
