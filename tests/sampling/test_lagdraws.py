@@ -192,7 +192,7 @@ def test_walkers_of_several_paths_leave_where_they_began() -> None:
 def test_more_lags_than_the_best_and_one_are_begun_too() -> None:
     """Tabulated elsewhere a search may have another best than the one that a number of lags was asked for."""
     search = searched()
-    for lags in range(1, 5):
-        begun = _begun(search, lags, np.random.default_rng(0))
-        assert begun.dimension == lags + 1
+    for count in range(1, 5):
+        begun = _begun(search, count, np.random.default_rng(0))
+        assert begun.dimension == count + 1
         assert (begun.draw(50, np.random.default_rng(1))[:, :-1] < 30.0).all()
