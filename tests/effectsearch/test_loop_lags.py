@@ -15,6 +15,7 @@ from lcopa_bayes.effectsearch.lags import lags_of, linear_dynamics
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
+from lcopa_bayes.effectsearch.verdict import Verdict
 from lcopa_bayes.model.effects.dynamics import RiseFallAsymmetry
 from lcopa_bayes.model.effects.generic import UnmodelledLag
 from lcopa_bayes.model.effects.response import Clipping
@@ -87,6 +88,20 @@ def test_a_structure_that_is_stated_stays_alone():
     found = loop(study_of(TIMES[:1]), library=LIBRARY, sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "clean"
     assert found.lags == ()
+
+
+def test_what_stays_unexplained_keeps_its_sums_of_lags(monkeypatch: pytest.MonkeyPatch):
+    """Whatever is missing, a plant of another form is as likely as before, and intervals are over it too."""
+    unexplained = Verdict("unexplained", "tentative", "Something is missing.")
+    monkeypatch.setattr("lcopa_bayes.effectsearch.loop.decide", lambda findings: unexplained)
+    found = loop(study_of(TIMES[:1]), library=LIBRARY, sample=False, quick=True)
+    assert found.verdict.kind == "unexplained"
+    (one,) = found.lags
+    assert one.support == "both"
+    parts = {}
+    for name, each in (("over", found), ("without", replace(found, lags=()))):
+        parts[name] = next(len(figure.parts) for figure in each.figures if figure.name == "delay[x]")
+    assert parts["over"] == parts["without"] + 1
 
 
 @pytest.mark.slow
