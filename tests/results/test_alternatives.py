@@ -114,7 +114,7 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
     assert number.shares == {"plant": 0.5, "lags": 0.5}
     pooled = np.concatenate([np.repeat(ours, theirs.size), np.repeat(theirs, ours.size)])
     assert number.estimate.lower == pytest.approx(float(np.quantile(pooled, 0.05)), rel=0.02)
-    noise, structure = parts_of_sd([number.plant, number.lags], np.array([0.5, 0.5]))
+    noise, structure = parts_of_sd([ours, theirs], np.array([0.5, 0.5]))
     assert noise**2 + structure**2 == pytest.approx(float(np.var(pooled)), rel=1e-6)
 
 
