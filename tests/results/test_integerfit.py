@@ -110,4 +110,6 @@ def test_starts_have_the_orders_that_are_held() -> None:
     new = problem_of(study).posterior.table
     found = list(starts(old, values, new, orders))
     assert [list(one[new.of_kind("order")]) for one in found] == [[2.0, 1.0]] * 2
+    time = values[old.of_kind("time")[0]]
+    assert [list(one[new.of_kind("time")]) for one in found] == [[time, time]] * 2
     assert [float(one[new.of_kind("delay")[0]]) for one in found] == pytest.approx([0.3, 0.15])
