@@ -2,8 +2,8 @@
 
 Each response axis has its own, held against the fitted plant by Akaike's criterion: other families follow the
 records as well, and have other steady values and delays. Where sums of lags for all paths to an axis do not
-follow it, because one of them rings, each path has its own beside the others as they are fitted: what these
-add is taken off the samples, which may lie anywhere along its slopes in their parameters.
+follow it, because one of them rings, each path has its own beside the others as they are fitted: the samples
+may lie anywhere along the slopes of what these add in their parameters.
 """
 
 from __future__ import annotations
@@ -273,7 +273,7 @@ def _alternative(
 ) -> Alternative:
     square, noise = plant.square(axis), plant.noise[axis]
     beside = tuple(one for one in _open(plant.posterior, axis) if one not in paths)
-    problem, open_to = _without(problem, plant, beside)
+    open_to = _slopes(plant, problem, beside)
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 100 * paths[0].drive + 10 * _STREAM + axis
     drives = [one.drive for one in paths]
@@ -284,26 +284,19 @@ def _alternative(
     return Alternative(paths, searches, advantage, square, seed, beside)
 
 
-def _without(
-    problem: Problem, plant: FittedPlant, beside: Sequence[PathSlot]
-) -> tuple[Problem, tuple[Matrix, ...]]:
-    """A `lag_problem` less what some paths to one response axis add as they are fitted, and the slopes of
-    that in their parameters, record by record (parameters, samples)."""
+def _slopes(plant: FittedPlant, problem: Problem, beside: Sequence[PathSlot]) -> tuple[Matrix, ...]:
+    """Slopes of what some paths to one response axis add in their parameters where they are fitted, record
+    by record of a `lag_problem`, (parameters, samples). Their gains are among them: what they add lies along
+    these."""
     if not beside:
-        return problem, ()
+        return ()
     table, axis = plant.posterior.table, beside[0].response
     gains = [table.at("gain", axis, one.drive) for one in beside]
     used, values = sorted(_used(table, beside)), plant.values.copy()
     values[[k for k in table.of_kind("gain") if k not in gains]] = 0.0
     posterior = replace(plant.posterior, samples=problem.posterior.samples)
-    own = (block for at, _, block, _ in LeastSquares(posterior).plain_slopes(values[None]) if at == axis)
-    samples, open_to = [], []
-    for record, slopes in zip(posterior.samples, own, strict=True):
-        axes, observed = list(record.axes), record.axes[axis]
-        axes[axis] = replace(observed, values=observed.values - slopes[:, gains] @ values[gains])
-        samples.append(replace(record, axes=tuple(axes)))
-        open_to.append(slopes[:, used].T)
-    return replace(problem, posterior=replace(problem.posterior, samples=tuple(samples))), tuple(open_to)
+    blocks = LeastSquares(posterior).plain_slopes(values[None])
+    return tuple(slopes[:, used].T for at, _, slopes, _ in blocks if at == axis)
 
 
 def _used(table: ParameterTable, paths: Sequence[PathSlot]) -> set[int]:
