@@ -23,16 +23,16 @@ from lcopa_bayes.effectsearch.refits import without
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State, fit_scores, held_out_scores, left_out_scores, over_noise
 from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED, Dynamics
-from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.integerorders import (
     Orders,
     most_likely,
     nearest,
+    problem_with,
     said_of,
     starts,
     weight_of,
-    with_orders,
 )
 from lcopa_bayes.inference.parameter import Parameter
 
@@ -120,13 +120,11 @@ def _held(state: State, problem: Problem, orders: Orders) -> IntegerPlant | None
     """The plant with these elements at integer orders; None where it cannot follow the records."""
     table = state.model.plant.table
     try:
-        study = with_orders(problem.study, table, orders)
-        own = problem_of(study)
-        own = own if problem.refinement == 1 else own.refined(problem.refinement)
+        own = problem_with(problem, table, orders)
         model = ExtendedModel(own.posterior)
         values = state.model.values(state.optimum.x)
         begun = [model.coordinates(one) for one in starts(table, values, model.plant.table, orders)]
-        model = model.at_scales(begun[0], campaign_places(study)).having(*state.model.effects)
+        model = model.at_scales(begun[0], campaign_places(own.study)).having(*state.model.effects)
         model = replace(model, wider=state.model.wider)
         effects = state.optimum.x[state.model.plant_size :]
         optimum = Regression(model, state.whitening).best([np.concatenate([x, effects]) for x in begun])

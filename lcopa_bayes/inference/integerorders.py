@@ -19,6 +19,7 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 
 Orders = Mapping[str, tuple[float, ...]]
@@ -59,7 +60,7 @@ def most_likely(orders: Orders, held: Callable[[Orders], _Held | None]) -> _Held
     apart = [held({name: own}) for name, own in orders.items()] if len(orders) > 1 else []
     borne = [one.orders for one in apart if one is not None and one.log_odds > 0.0]
     some = {name: own for one in borne for name, own in one.items()}
-    found = [every, *apart, held(some) if len(some) > 1 else None]
+    found = [every, *apart, held(some) if 1 < len(some) < len(orders) else None]
     best = max((one for one in found if one is not None), key=lambda one: one.log_odds, default=None)
     return best if best is not None and best.log_odds > np.log(LEAST) else None
 
@@ -102,6 +103,12 @@ def with_orders(study: Study, table: ParameterTable, orders: Orders) -> Study:
             full = f"order_{k + 1}_{name}" if name else f"order_{k + 1}"
             held[full] = PriorSettings(full, fixed=order)
     return replace(study, model=model, priors={**study.priors, **held})
+
+
+def problem_with(problem: Problem, table: ParameterTable, orders: Orders) -> Problem:
+    """A problem with elements of these orders, on blocks as narrow; InputError as `problem_of`."""
+    own = problem_of(with_orders(problem.study, table, orders))
+    return own if problem.refinement == 1 else own.refined(problem.refinement)
 
 
 def starts(

@@ -168,22 +168,21 @@ def alternatives_of(
 
 def _plant(fitted: Fit) -> FittedPlant | None:
     """At the best of its draws; None of one that sums of lags are not held against."""
-    posterior, draws = fitted.problem.posterior, fitted.draws
+    posterior = fitted.problem.posterior
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
         return None
-    best = draws.flat[[int(draws.log_density.argmax())]]
-    best = posterior.complete(posterior.coordinates(best), None)
-    axes = range(len(posterior.table.layout.responses))
-    noise = tuple(posterior.noise_parameters(best, axis)[0] for axis in axes)
-    return FittedPlant(fitted.problem, best[0], noise, fitted.curves, fitted.run.plan.seed)
+    best, axes = fitted.best, range(len(posterior.table.layout.responses))
+    noise = tuple(posterior.noise_parameters(best[None], axis)[0] for axis in axes)
+    return FittedPlant(fitted.problem, best, noise, fitted.curves, fitted.run.plan.seed)
 
 
 def with_alternatives(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> Fit:
     """A fit with the figures of its step responses over all plants, and what follows for its grade."""
-    found, integer = alternatives_of(fitted), integer_fit(fitted, jobs=jobs, quick=quick)
+    own, integer = _plant(fitted), integer_fit(fitted, jobs=jobs, quick=quick)
+    found = lags_beside(own) if own else ()
     if not found and integer is None:
         return fitted
-    own, other = _plant(fitted), _plant(integer.draws) if integer else None
+    other = _plant(integer.draws) if integer else None
     if own and other:
         found = held_against(found, own, replace(other, noise=own.noise))
     over = Alternatives(found, tuple(_numbers(fitted, found, integer)), integer)
@@ -224,11 +223,9 @@ def _numbers(fitted: Fit, found: Sequence[Alternative], integer: IntegerFit | No
     for name, one in named["plant"].items():
         lags = weight_in(name, weight_of) if name in named.get("lags", {}) else 0.0
         shares = {"plant": (1 - lags) * (1 - share), "integer": (1 - lags) * share, "lags": lags}
-        parts = {kind: own[name] for kind, own in named.items() if name in own}
-        parts = {kind: own for kind, own in parts.items() if kind == "plant" or shares[kind]}
+        parts = {kind: own[name] for kind, own in named.items() if kind == "plant" or shares[kind]}
         if len(parts) > 1:
-            held = {kind: shares[kind] for kind in parts}
-            out.append(_averaged(one, parts, held, min(ess), grade))
+            out.append(_averaged(one, parts, {kind: shares[kind] for kind in parts}, min(ess), grade))
     return out
 
 

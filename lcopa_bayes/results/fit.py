@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from xarray import DataTree
 
-from lcopa_bayes.core.arrays import Matrix, digest_of
+from lcopa_bayes.core.arrays import Matrix, Vector, digest_of
 from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
@@ -90,6 +90,14 @@ class Fit(Predictive):
     def near(self) -> Posterior:
         """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
         return replace(self.problem.posterior, surrogate=self.run.surrogate)
+
+    @property
+    def best(self) -> Vector:
+        """Table values of the most probable draw, linear parameters at their conditional mean, (rows,)."""
+        posterior = self.problem.posterior
+        best = self.draws.flat[[int(self.draws.log_density.argmax())]]
+        values: Vector = posterior.complete(posterior.coordinates(best), None)[0]
+        return values
 
     @property
     def by_name(self) -> dict[str, Matrix]:

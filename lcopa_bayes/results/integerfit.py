@@ -10,15 +10,15 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.integerorders import (
     Orders,
     most_likely,
     nearest,
+    problem_with,
     said_of,
     starts,
     weight_of,
-    with_orders,
 )
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
@@ -80,41 +80,37 @@ class IntegerFit:
 def integer_fit(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> IntegerFit | None:
     """The plant of a fit with integer orders of all elements that the records let have them, sampled as that
     was; None without any, or where its plant has effects."""
-    posterior, draws = fitted.problem.posterior, fitted.draws
+    posterior = fitted.problem.posterior
     if posterior.simulation is not None:
         return None
-    best = draws.flat[[int(draws.log_density.argmax())]]
-    values = _optimum(posterior, [posterior.complete(posterior.coordinates(best), None)[0]])
+    level, values = _optimum(posterior, [fitted.best])
     orders = dict(nearest(posterior.table, values))
-    found = most_likely(orders, lambda own: _held(fitted, values, own))
+    found = most_likely(orders, lambda own: _held(fitted, level, values, own))
     if found is None or found.weight < _PART:
         return None
     return replace(found, sampled=fit(found.problem.study, jobs=jobs, quick=quick))
 
 
-def _held(fitted: Fit, values: Vector, orders: Orders) -> IntegerFit | None:
-    """The plant with these elements at integer orders; None where it cannot follow the records."""
+def _held(fitted: Fit, level: float, values: Vector, orders: Orders) -> IntegerFit | None:
+    """The plant with these elements at integer orders beside the fitted one at its optimum, of log likelihood
+    `level`; None where it cannot follow the records."""
     posterior = fitted.problem.posterior
     try:
-        problem = problem_of(with_orders(fitted.study, posterior.table, orders))
-        if fitted.problem.refinement > 1:
-            problem = problem.refined(fitted.problem.refinement)
+        problem = problem_with(fitted.problem, posterior.table, orders)
         own = problem.posterior
         begun = starts(posterior.table, values, own.table, orders)
-        optimum = _optimum(own, [own.table.canonical(one[None])[0] for one in begun])
+        reached, optimum = _optimum(own, [own.table.canonical(one[None])[0] for one in begun])
     except (ArithmeticError, InputError):
         return None
     fewer = len(LeastSquares(posterior).columns) - len(LeastSquares(own).columns)
-    gained = _likelihood(own, optimum) - _likelihood(posterior, values)
+    gained = reached - level
     saved = 0.5 * fewer * float(np.log(posterior.size))
     return IntegerFit(orders, problem, optimum, gained, gained + saved)
 
 
-def _optimum(posterior: Posterior, begun: Sequence[Vector]) -> Vector:
-    """The likeliest table values of descents from some under their noise, (rows,)."""
-    found = [LeastSquares(posterior).solve(one)[0] for one in begun]
-    return max(found, key=lambda one: _likelihood(posterior, one))
-
-
-def _likelihood(posterior: Posterior, values: Vector) -> float:
-    return float(posterior.joint_log_likelihood(values[None])[0])
+def _optimum(posterior: Posterior, begun: Sequence[Vector]) -> tuple[float, Vector]:
+    """The highest log likelihood of descents from some table values under their noise, and the values there,
+    (rows,)."""
+    found = np.array([LeastSquares(posterior).solve(one)[0] for one in begun])
+    levels = posterior.joint_log_likelihood(found)
+    return float(levels.max()), found[int(levels.argmax())]

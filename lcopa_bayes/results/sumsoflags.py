@@ -130,17 +130,22 @@ class FittedPlant:
         """Of its problem."""
         return self.problem.posterior
 
-    def square(self, axis: int) -> float:
-        """Its whitened residual on a response axis, squared [-]; of the samples that sums of lags follow."""
-        posterior, out = thinned(self.posterior), 0.0
+    @cached_property
+    def squares(self) -> Vector:
+        """Whitened residual of each response axis, squared, at the samples that sums of lags follow [-]."""
+        posterior, out = thinned(self.posterior), np.zeros(len(self.noise))
         assert isinstance(posterior.noise, GaussianNoise)
         units = posterior.responses(self.values[None])
         for r, samples in enumerate(posterior.samples):
-            observed = samples.axes[axis]
-            residual = posterior.residual(axis, r, observed, self.values[None], units[r])
-            white = posterior.noise.standard(residual, self.noise[axis][None], observed.gaps)
-            out += float((white**2).sum())
+            for axis, observed in enumerate(samples.axes):
+                residual = posterior.residual(axis, r, observed, self.values[None], units[r])
+                white = posterior.noise.standard(residual, self.noise[axis][None], observed.gaps)
+                out[axis] += (white**2).sum()
         return out
+
+    def square(self, axis: int) -> float:
+        """That on one response axis [-]."""
+        return float(self.squares[axis])
 
     def parameters(self, paths: Sequence[PathSlot]) -> int:
         """Free parameters that paths to one response axis use, others of the axis included [-]."""
@@ -164,10 +169,12 @@ def lags_beside(
         paths = _open(plant.posterior, axis)
         if not paths:
             continue
-        every = _alternative(plant, problem, axis, paths, kinds)
+        every = _alternative(plant, problem, paths, (), kinds)
         each: list[Alternative] = []
         if single and every.support == "plant" and len(paths) > 1:
-            each = [_alternative(plant, problem, axis, (one,), kinds) for one in paths]
+            others = [tuple(other for other in paths if other != one) for one in paths]
+            pairs = zip(paths, others, strict=True)
+            each = [_alternative(plant, problem, (one,), beside, kinds) for one, beside in pairs]
         out += [one for one in each if one.support != "plant"] or [every]
     return tuple(out)
 
@@ -269,10 +276,14 @@ def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
 
 
 def _alternative(
-    plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...], kinds: Sequence[Kind]
+    plant: FittedPlant,
+    problem: Problem,
+    paths: tuple[PathSlot, ...],
+    beside: tuple[PathSlot, ...],
+    kinds: Sequence[Kind],
 ) -> Alternative:
+    axis = paths[0].response
     square, noise = plant.square(axis), plant.noise[axis]
-    beside = tuple(one for one in _open(plant.posterior, axis) if one not in paths)
     open_to = _slopes(plant, problem, beside)
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 100 * paths[0].drive + 10 * _STREAM + axis

@@ -4,8 +4,8 @@
 
 Every campaign (`truths`) is fitted as a user would, with the structure left to the records, and the 90 %
 intervals of four figures of every path are held against the true ones: those of the fitted plant alone, and
-those that are reported, which are over the fitted plant and sums of lags. Finished campaigns are kept in the
-folder: a killed run goes on where it stopped.
+those that are reported, which are over the fitted plant, integer orders and sums of lags. Finished campaigns
+are kept in the folder: a killed run goes on where it stopped.
 """
 
 import argparse

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 from effectsearch.test_integerplants import record
+from inference.test_lagsum import lags
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.inversion import unit_step
@@ -26,14 +27,6 @@ WEIGHTS, TIMES, DELAY = (0.5, 0.4), (0.3, 4.0), 0.2
 """Of a path of two lags a decade apart, which no single fractional term is."""
 
 
-def lags(since: Vector, weights: tuple[float, ...], times: tuple[float, ...]) -> Vector:
-    """Response of parallel lags to a unit step."""
-    after = np.maximum(since, 0.0)
-    return np.asarray(
-        -np.sum([w * np.expm1(-after / t) for w, t in zip(weights, times, strict=True)], axis=0)
-    )
-
-
 def rung(since: Vector, path: TransferPath) -> Vector:
     """Response of a resonance to a unit step."""
     return np.where(since > 0, path.gain * unit_step(path, np.maximum(since, 1e-9)), 0.0)
@@ -50,7 +43,7 @@ def mixed(seed: int) -> Record:
     one = record(f"run{seed}", (RING, replace(RING, gain=0.0)), seed)
     read = one.response[:, 0].copy()
     for at, size in steps(one, 1):
-        read += size * lags(one.time - at - DELAY, WEIGHTS, TIMES)
+        read += size * lags(one.time - at, WEIGHTS, TIMES, DELAY)
     return replace(one, response=read[:, None])
 
 
@@ -100,7 +93,7 @@ def test_the_square_beside_other_paths_is_that_of_a_joint_fit():
             for at, size in steps(each, 0):
                 read = read - size * rung(each.time - at - late, ring)
             for at, size in steps(each, 1):
-                read = read - size * lags(each.time - at - delay, (first, second), (fast, slow))
+                read = read - size * lags(each.time - at, (first, second), (fast, slow), delay)
             out.append(read / sd)
         return np.concatenate(out)
 
