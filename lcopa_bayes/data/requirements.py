@@ -13,12 +13,15 @@ before its drives have changed,
   on top of a slow disturbance hides in the samples how correlated that is; and
 - the response moves by `_SHARE` of its range, so that slight drifts stay what they are.
 
-An early row without a response states what the plant rested under; such a record is not examined.
+An early row without a response states what the plant rested under; such a record is not examined. Where no
+drive moves in a record and a straight line follows its response as well as a relaxation does, the movement
+may be a drift, which effects describe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -53,14 +56,70 @@ _EXACT = 1e-6
 """Noise below this share of a response's range is rounding [-]."""
 
 
-def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[str]:
-    """A problem for every record and response axis that moves before a drive does; all have equal axes."""
+@final
+class Movement(NamedTuple):
+    """A response that moves before a drive can move it."""
+
+    record: Record
+    axis: int
+    """Position of the response."""
+    size: float
+    """[response unit]."""
+    range: float
+    """Of the response in the records to fit [response unit]."""
+    until: int
+    """Rows up to and with the one at which a drive first changes."""
+    straight: bool
+    """Whether no drive changes and a line follows it as well as a relaxation does."""
+
+    def __str__(self) -> str:
+        """What was seen and what to do."""
+        drift = f"{_STRAIGHT}; `loop` traces one, and [effects] use can declare it. " if self.straight else ""
+        return (
+            f"{self._seen}: the plant was not at rest there, as the model assumes. {drift}{self._advice}; if "
+            "it is not known, leave the responses empty until they have come to rest. A row before the first "
+            "with the same drive states that the plant was at rest and the response drifts"
+        )
+
+    @property
+    def as_drift(self) -> str:
+        """What was seen of one that is `straight`, and what it may be instead of a drift."""
+        return f"{self._seen}. {_STRAIGHT}, and is taken for one. {self._advice}"
+
+    @property
+    def _seen(self) -> str:
+        record, axis = self.record, self.record.response_axes[self.axis]
+        drives = zip(record.drive_axes, record.drive[0], strict=True)
+        rest = ", ".join(f"{drive.name} = {value:.6g} {drive.unit}" for drive, value in drives)
+        last = f"{record.time[self.until - 1]:.6g} {record.time_unit}"
+        until_then = "throughout" if self.until == record.time.size else f"until {last}"
+        return (
+            f"record {record.name!r}: response {axis.name!r} moves by {self.size:.3g} {axis.unit} "
+            f"({100 * abs(self.size) / self.range:.0f} % of its range) while the drive stays as in the first "
+            f"row ({rest}) {until_then}"
+        )
+
+    @property
+    def _advice(self) -> str:
+        time = self.record.time
+        return (
+            "If the drive was another one before the record, add a row before the first (time "
+            f"{time[0] - float(np.median(np.diff(time))):.6g} {self.record.time_unit}, that drive, empty "
+            "responses)"
+        )
+
+
+_STRAIGHT = "It moves along a straight line, as a drift does"
+
+
+def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[Movement]:
+    """Every response of a record that moves before a drive does; all records have equal axes."""
     if not fit:
         return []
     responses = np.concatenate([record.response for record in fit])
     spans = np.nanmax(responses, axis=0) - np.nanmin(responses, axis=0)
     reach = np.ptp(np.concatenate([record.drive for record in fit]), axis=0)
-    problems = []
+    found = []
     for record in (*fit, *held_out):
         if np.isnan(record.response[0]).all():
             continue
@@ -70,10 +129,12 @@ def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[
             seen = np.flatnonzero(np.isfinite(record.response[: until - late, axis]))
             if seen.size < _FEWEST or not span > 0.0:
                 continue
-            moved = unrest(record.time[seen], record.response[seen, axis], float(span))
+            times, values = record.time[seen], record.response[seen, axis]
+            moved = unrest(times, values, float(span))
             if moved is not None:
-                problems.append(_said(record, axis, moved, float(span), until))
-    return problems
+                still = until == record.time.size and straight(times, values, float(span))
+                found.append(Movement(record, axis, moved, float(span), until, still))
+    return found
 
 
 def _still(record: Record, reach: Vector) -> int:
@@ -91,10 +152,27 @@ def unrest(time: Vector, values: Vector, span: float) -> float | None:
     moved = float(values[-max(1, n // 6) :].mean() - values[: max(1, n // _MEANS)].mean())
     if abs(moved) < _SHARE * span:
         return None
-    for many in {max(1, n // _MEANS), max(1, n // _MOST)}:
-        if relaxation(_means(time, many), _means(values, many), _EXACT * span) < _THRESHOLD:
-            return None
-    return moved
+    least = _EXACT * span
+    over = (relaxation(*means, least) for means in _reduced(time, values))
+    return moved if all(ratio >= _THRESHOLD for ratio in over) else None
+
+
+def straight(time: Vector, values: Vector, span: float) -> bool:
+    """Whether a line follows samples (n,) so well that noise explains what a relaxation explains better."""
+    least = _EXACT * span
+    return any(relaxation(*means, least, line=True) < _THRESHOLD for means in _reduced(time, values))
+
+
+def drifts(time: Vector, values: Vector) -> bool:
+    """Whether samples (n,) of a response that nothing drives move, of any size, and along a straight line."""
+    span = float(np.ptp(values)) if values.size >= _FEWEST else 0.0
+    return span > 0.0 and unrest(time, values, span) is not None and straight(time, values, span)
+
+
+def _reduced(time: Vector, values: Vector) -> Iterator[tuple[Vector, Vector]]:
+    """Times and values of a stretch in means of neighbours, many to a mean and few."""
+    for many in {max(1, values.size // most) for most in (_MEANS, _MOST)}:
+        yield _means(time, many), _means(values, many)
 
 
 def _means(values: Vector, many: int) -> Vector:
@@ -102,8 +180,9 @@ def _means(values: Vector, many: int) -> Vector:
     return np.array([part.mean() for part in np.array_split(values, values.size // many)])
 
 
-def relaxation(time: Vector, values: Vector, exact: float) -> float:
-    """Twice the log ratio of the likelihood of the best relaxation of samples (n,) to that of a constant [-].
+def relaxation(time: Vector, values: Vector, exact: float, *, line: bool = False) -> float:
+    """Twice the log ratio of the likelihood of the best relaxation of samples (n,) to that of a constant, or
+    with `line` of a straight line beside a constant [-].
 
     `exact` is the least standard deviation of the noise [response unit].
     """
@@ -113,40 +192,23 @@ def relaxation(time: Vector, values: Vector, exact: float) -> float:
     constants = np.geomspace(0.5 * period, _LONGEST * at[-1], _TIMES)
     late = [np.maximum(at - onset * at[-1], 0.0) for onset in _ONSETS]
     relaxed = np.exp(-np.concatenate([one / constants[:, None] for one in late]))
-    curves = np.concatenate((relaxed, np.ones((1, at.size)), values[None]))
+    plain = np.stack((at / at[-1], np.ones(at.size)))[0 if line else 1 :]
+    curves = np.concatenate((relaxed, values[None], plain))
     best, constant = -np.inf, -np.inf
     for rho in _RHO:
         link = rho ** (gaps / period)
         scale = np.sqrt(1.0 - link**2)
         white = np.concatenate((curves[:, :1], (curves[:, 1:] - link * curves[:, :-1]) / scale), axis=1)
         level = -np.log(scale).sum()
-        exps, one, seen = white[:-2], white[-2], white[-1]
-        one = one / np.sqrt(one @ one)
-        seen, exps = seen - (one @ seen) * one, exps - np.outer(exps @ one, one)
+        basis, _ = np.linalg.qr(white[-len(plain) :].T)
+        beyond = white[: -len(plain)] - (white[: -len(plain)] @ basis) @ basis.T
+        exps, seen = beyond[:-1], beyond[-1]
         least = values.size * exact**2
         power = float(seen @ seen) + least
         left = power - float(((exps @ seen) ** 2 / np.einsum("tn,tn->t", exps, exps)).max())
         constant = max(constant, level - 0.5 * values.size * np.log(power))
         best = max(best, level - 0.5 * values.size * np.log(max(left, least)))
     return 2.0 * float(best - constant) * (1.0 - 4.0 / values.size)
-
-
-def _said(record: Record, axis: int, moved: float, span: float, until: int) -> str:
-    """What was seen and what to do."""
-    seen = record.response_axes[axis]
-    drives = zip(record.drive_axes, record.drive[0], strict=True)
-    rest = ", ".join(f"{drive.name} = {value:.6g} {drive.unit}" for drive, value in drives)
-    last = f"{record.time[until - 1]:.6g} {record.time_unit}"
-    until_then = "throughout" if until == record.time.size else f"until {last}"
-    early = f"{record.time[0] - float(np.median(np.diff(record.time))):.6g} {record.time_unit}"
-    return (
-        f"record {record.name!r}: response {seen.name!r} moves by {moved:.3g} {seen.unit} "
-        f"({100 * abs(moved) / span:.0f} % of its range) while the drive stays as in the first row ({rest}) "
-        f"{until_then}: the plant was not at rest there, as the model assumes. If the drive was another one "
-        f"before the record, add a row before the first (time {early}, that drive, empty responses); if it "
-        "is not known, leave the responses empty until they have come to rest. A row before the first with "
-        "the same drive states that the plant was at rest and the response drifts"
-    )
 
 
 _ROUNDING = 1e-9
@@ -157,9 +219,14 @@ _SCALE = 1e100
 """Ranges beyond it, or below its inverse, overflow once squared and divided by each other [any unit]."""
 
 
-def unmet(study: Study) -> list[str]:
-    """A problem for everything in the records that keeps a fit of them from meaning anything."""
-    return unmet_apart_from_rest(study) or not_at_rest(study.fit, study.held_out)
+def unmet(study: Study, *, drifts: bool = False) -> list[str]:
+    """A problem for everything in the records that keeps a fit of them from meaning anything.
+
+    `drifts`: an effect of the study describes responses that drift where no drive moves.
+    """
+    if problems := unmet_apart_from_rest(study):
+        return problems
+    return [str(one) for one in not_at_rest(study.fit, study.held_out) if not (drifts and one.straight)]
 
 
 def unmet_apart_from_rest(study: Study) -> list[str]:

@@ -165,7 +165,8 @@ def fitted_base(
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
     than the best named effect, or more together with what it leaves to be named. InputError when a record
-    moves before its drive does and no drive before the first row explains that.
+    moves before its drive does, no drive before the first row explains that, and it is not a line that an
+    effect which goes on at rest may follow.
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
@@ -178,7 +179,9 @@ def fitted_base(
         rival = _explained(separate[0], library, np.random.default_rng([study.seed, 14]), draws, crew)
         mended = mended if mended is None or mended.power < rival else None
     if mended is None:
-        refuse_if(not_at_rest(study.fit, study.held_out))
+        drifts = any(kind.card.resting for kind in library)
+        moving = not_at_rest(study.fit, study.held_out)
+        refuse_if([str(one) for one in moving if not (drifts and one.straight)])
     else:
         study = replace(mended.study, model=study.model)
         base = _based(study, crew=crew)._replace(sentence=mended.sentence)

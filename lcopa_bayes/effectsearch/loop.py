@@ -14,6 +14,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.agreement import Disagreement, disagreements
+from lcopa_bayes.data.requirements import not_at_rest
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
@@ -244,7 +245,8 @@ def _looped(
         problem, base, start, enlarged, wider = based(study, kinds)
     before = _side(problem, start)
     contrary = disagreements((*study.fit, *study.held_out), crew)
-    cautions = (*map(str, contrary), *base.caution, *single_record(study))
+    drifting = (one.as_drift for one in not_at_rest(problem.study.fit, problem.study.held_out))
+    cautions = (*map(str, contrary), *drifting, *base.caution, *single_record(study))
     alone = len(study.fit) == 1 and not study.held_out
     searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
     if not wrong or (base.smooth and wrong == base.failed):

@@ -181,7 +181,7 @@ def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Ob
     `delay` is the shortest fitted delay [time unit]; 0.8 of it counts as dead time.
     """
     counts = [quiet_samples(record, axis, delay) for record in samples]
-    return [one.axes[axis].first(count) for one, count in zip(samples, counts, strict=True) if count > 1]
+    return [one.resting(axis, count) for one, count in zip(samples, counts, strict=True) if count > 1]
 
 
 def repeat_pieces(samples: Sequence[Samples], axis: int) -> list[Observed]:

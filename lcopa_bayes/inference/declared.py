@@ -19,6 +19,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
@@ -73,6 +74,13 @@ def used_kinds(study: Study, layout: Layout) -> tuple[tuple[type[Effect], ...], 
         if axis not in names
     ]
     return tuple(kinds), problems
+
+
+def obstacles(study: Study) -> list[str]:
+    """What keeps a fit of a study's records from meaning anything (`requirements`), given its effects: one
+    that goes on at rest describes a response that drifts where no drive moves."""
+    known = catalogue(study.effects.add, study.folder) if study.effects.use else {}
+    return unmet(study, drifts=any(known[name].card.resting for name in study.effects.use if name in known))
 
 
 def _counted(count: int, what: str) -> str:

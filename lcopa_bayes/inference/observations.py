@@ -6,7 +6,7 @@ What samples at rest say about white measurement noise and a correlated part.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -16,6 +16,7 @@ from scipy.special import expit
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.requirements import drifts
 from lcopa_bayes.inference.noise import WhiteAR1
 
 _ROUNDED = 1e-4
@@ -92,8 +93,22 @@ class Samples:
 
     def quiet(self, axis: int) -> Observed:
         """Samples of an axis taken before any drive change can have acted, that at the change included unless
-        it has moved."""
-        return self.axes[axis].first(int(np.count_nonzero(self._at_rest(axis))))
+        it has moved; as `resting`."""
+        return self.resting(axis, int(np.count_nonzero(self._at_rest(axis))))
+
+    def resting(self, axis: int, count: int) -> Observed:
+        """The first samples of an axis, which nothing drives. Where no drive moves in the record they are
+        taken about the line that they drift along, if they do: noise so smooth would hide every effect."""
+        piece = self.axes[axis].first(count)
+        if not self._drifting[axis]:
+            return piece
+        since = self.times[piece.index] - self.times[piece.index].mean()
+        return replace(piece, values=piece.values - since * (since @ piece.values) / (since @ since))
+
+    @cached_property
+    def _drifting(self) -> tuple[bool, ...]:
+        still = np.isinf(self.first_change)
+        return tuple(still and drifts(self.times[one.index], one.values) for one in self.axes)
 
     def _at_rest(self, axis: int) -> Flags:
         times = self.times[self.axes[axis].index]

@@ -20,9 +20,9 @@ from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.data.agreement import disagreements
-from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import obstacles
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
@@ -164,7 +164,7 @@ def searched(
     Of `others`, posteriors with their optima, the first that the study's model contains is looked at too,
     with what it lacks added in a few ways: a richer model is no less likely.
     """
-    refuse_if(unmet(study))
+    refuse_if(obstacles(study))
     problem = problem_of(study)
     rng = np.random.default_rng([study.seed, _STREAM, 1])
     lifts = (

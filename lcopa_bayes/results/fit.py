@@ -16,9 +16,9 @@ from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.core.parallel import meanwhile
-from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import obstacles
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.adequacy import limitations
@@ -195,7 +195,7 @@ def fit(
     if study.model.terms == "auto":
         raise ValueError("the number of terms is not settled yet")
     if searched is None:
-        refuse_if(unmet(study))
+        refuse_if(obstacles(study))
     problem = searched[0] if searched else problem_of(study)
     if folder:
         writable_folder(folder)

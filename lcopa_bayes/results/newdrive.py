@@ -16,8 +16,8 @@ from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
-from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.declared import obstacles
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.fittedrange import FittedRange, Outside
 from lcopa_bayes.results.frequency import transfer_function
@@ -223,7 +223,7 @@ def _recorded(problem: Problem, draws: Draws, record: Record) -> tuple[Record, l
             f"record {record.name!r} is {same[0]!r} of the fit, where errors are not those of a prediction; "
             "give another record, or leave out its responses for bands under its drive"
         )
-    if problems := unmet(study):
+    if problems := obstacles(study):
         raise InputError(problems)
     (held,) = study.held_out
     samples, model = problem.simulated(study.held_out)

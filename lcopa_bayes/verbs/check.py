@@ -20,9 +20,9 @@ from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import obstacles
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.priors import Prior
@@ -51,7 +51,7 @@ def inventory(study: Study) -> dict[str, Any]:
 
     InputError where its settings do not fit its records.
     """
-    problem, obstacles = problem_of(with_least_terms(study)), unmet(study)
+    problem, problems = problem_of(with_least_terms(study)), obstacles(study)
     contradicted = disagreements((*study.fit, *study.held_out))
     disagree = [str(one) for one in contradicted]
     rows = problem.posterior.table.rows
@@ -63,12 +63,12 @@ def inventory(study: Study) -> dict[str, Any]:
             f"A fit takes time in proportion to the {problem.posterior.size} samples; `lcopa-bayes new "
             "--average` puts means in their place and states what that loses."
         )
-    verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
+    verdict = f"To mend before a fit: {'; '.join(problems)}." if problems else "The records can be fitted."
     verdict = " ".join([verdict, *(one.sentence for one in contradicted)])
 
     def remarked(record: Record) -> dict[str, Any]:
         """What was read of a record, with the remarks that name it."""
-        own = [one for one in obstacles if one.startswith(f"record {record.name!r}:")]
+        own = [one for one in problems if one.startswith(f"record {record.name!r}:")]
         own += [str(one) for one in contradicted if record.name in one.records]
         return _record(record, problem, held_out=record in study.held_out) | {"remarks": own}
 
@@ -77,9 +77,9 @@ def inventory(study: Study) -> dict[str, Any]:
             "study": study.name,
             "time_unit": study.time_unit,
             "verdict": verdict,
-            "grade": "unusable" if obstacles else "tentative" if disagree else "reliable",
+            "grade": "unusable" if problems else "tentative" if disagree else "reliable",
             "grade_reason": verdict,
-            "problems": obstacles,
+            "problems": problems,
             "disagreements": disagree,
             "sentences": sentences,
             "records": [remarked(one) for one in (*study.fit, *study.held_out)],

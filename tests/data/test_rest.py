@@ -16,9 +16,11 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Record, save_record
-from lcopa_bayes.data.requirements import not_at_rest, unrest
+from lcopa_bayes.data.requirements import not_at_rest, straight, unmet, unrest
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.inference.declared import obstacles
 from lcopa_bayes.results.fit import fit
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
@@ -78,12 +80,12 @@ def test_a_drive_that_was_switched_on_as_the_record_began_is_recognised():
 def test_an_early_row_states_what_the_plant_rested_under():
     record = switched(np.random.default_rng(2), before=0.0, first=1.0, noise_sd=0.02)
     (problem,) = not_at_rest([record])
-    assert "record 'step': response 'y' moves by " in problem
-    assert "while the drive stays as in the first row (u = 1 V) until " in problem
+    assert "record 'step': response 'y' moves by " in str(problem)
+    assert "while the drive stays as in the first row (u = 1 V) until " in str(problem)
     for level in (0.0, 1.0):
         assert not_at_rest([begun(record, level)]) == []
     (problem,) = not_at_rest([begun(record, 0.0)], [replace(record, name="apart")])
-    assert "record 'apart'" in problem
+    assert "record 'apart'" in str(problem)
 
 
 def begun(record: Record, level: float) -> Record:
@@ -110,6 +112,56 @@ def test_a_slight_drift_is_left_alone():
     record = switched(rng, before=1.0, first=1.0, noise_sd=0.002)
     drift = 0.08 * record.time[:, None] / record.time[-1]
     assert not_at_rest([replace(record, response=record.response + drift)]) == []
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
+def test_a_drift_is_straight_in_noise_of_any_correlation_and_a_relaxation_is_not(correlation):
+    """Lines are taken for curved in less than 1 % (a failure is more than the 99.9 % quantile of that), and
+    relaxations of up to half of the record for straight in none, 200 noise sd large."""
+    rng, curved = np.random.default_rng(int(10 * correlation)), 0
+    for k in range(120):
+        at = np.sort(rng.uniform(0.0, 3.0, (30, 120, 500)[k % 3]))
+        scatter = noise(at.size, correlation, rng) / 200
+        curved += not straight(at, 2.0 + at / 3.0 + scatter, 1.0)
+        lag = rng.uniform(0.1, 1.5)
+        assert not straight(at, np.exp(-at / lag) + scatter * (1.0 - np.exp(-3.0 / lag)), 1.0)
+    assert curved <= stats.binom.ppf(0.999, 120, 0.01)
+
+
+def with_moving_dark(shape: np.ndarray) -> Study:
+    """A step and a staircase of one lag, and a record without a drive that moves as `shape`, with noise."""
+    rng, at = np.random.default_rng(8), np.linspace(0.0, 20.0, 120)
+    device = Device(((path(2.0, 0.5, (1.5,), (1.0,)),),), (U,), (Y,), (0.3,))
+    changes, levels = at[[0, 18, 71]], np.array([[0.0], [1.0], [-0.5]])
+    records = []
+    for name, size in (("a", 1.0), ("b", -0.7), ("dark", 0.0)):
+        clean = device.response(Command(changes, size * levels, np.zeros(1)), at)[:, 0]
+        seen = clean + 0.02 * rng.standard_normal(at.size) + shape * (name == "dark")
+        drive = size * np.select([at >= at[71], at >= at[18]], [-0.5, 1.0], 0.0)
+        records.append(Record(name, at, drive[:, None], seen[:, None], (U,), (Y,), "ms"))
+    return replace(study(records[0]), fit=tuple(records))
+
+
+def test_the_loop_traces_a_drift_of_a_record_in_which_no_drive_moves():
+    drifting = with_moving_dark(0.06 * np.linspace(0.0, 20.0, 120))
+    with pytest.raises(InputError, match="along a straight line, as a drift does; `loop` traces one"):
+        fit(drifting)
+    found = loop(drifting, sample=False, quick=True)
+    assert found.names == ("pointing_drift",)
+    assert found.verdict.confidence == "tentative"
+    assert any("is taken for one. If the drive was another one before" in one for one in found.cautions)
+    (k,) = [k for k, name in enumerate(found.after.state.model.names) if "dark" in name and "drift" in name]
+    low, high = found.estimate(k)["lower"], found.estimate(k)["upper"]
+    # a line through 120 samples of noise 0.02 has a slope of sd 0.0063 over its length, 90 % are 3.3 sd wide
+    assert high - low == pytest.approx(0.021, rel=0.5)
+    assert abs(0.5 * (low + high) - 1.2) < high - low
+    assert not obstacles(found.study)  # what it declares describes the drift
+    assert unmet(found.study)
+
+
+def test_a_dark_record_that_relaxes_is_refused_by_the_loop():
+    with pytest.raises(InputError, match=r"at rest there, as the model assumes\. If the drive was another"):
+        loop(with_moving_dark(np.exp(-np.linspace(0.0, 20.0, 120) / 4.0)), sample=False, quick=True)
 
 
 def test_fit_and_loop_refuse_in_words_and_write_nothing(tmp_path, capfd):
