@@ -74,7 +74,7 @@ class Movement(NamedTuple):
 
     def __str__(self) -> str:
         """What was seen and what to do."""
-        drift = f"{_STRAIGHT}; `loop` traces one, and [effects] use can declare it. " if self.straight else ""
+        drift = f"{_STRAIGHT}; `loop` traces one, and {_DECLARED} declares it. " if self.straight else ""
         return (
             f"{self._seen}: the plant was not at rest there, as the model assumes. {drift}{self._advice}; if "
             "it is not known, leave the responses empty until they have come to rest. A row before the first "
@@ -110,6 +110,7 @@ class Movement(NamedTuple):
 
 
 _STRAIGHT = "It moves along a straight line, as a drift does"
+_DECLARED = 'use = ["pointing_drift"] in [effects]'
 
 
 def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[Movement]:
