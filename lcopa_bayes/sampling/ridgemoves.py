@@ -46,7 +46,8 @@ class RidgeMove(PopulationMove):
     ) -> tuple[Matrix, Vector]:
         """`proposed` with the times that follow from its ratios; its gains keep the level D(s_0).
 
-        The factor is the ratio of the volumes that the change of coordinates spans at both ends.
+        The factor is the ratio of the volumes that the change of coordinates spans at both ends; -inf where
+        it spans none, as between two terms alike: no move leads back from there.
         """
         before = element.shape(here, frequencies)
         orders = proposed[:, element.orders]
@@ -58,7 +59,9 @@ class RidgeMove(PopulationMove):
         proposed[:, element.following] = times
         proposed[void] = here[void]
         after = element.shape(proposed, frequencies)
-        factor = before.log_volume - after.log_volume
+        spanned: Flags = np.isfinite(before.log_volume) & np.isfinite(after.log_volume)
+        factor = np.full(len(here), -np.inf)
+        factor[spanned] = before.log_volume[spanned] - after.log_volume[spanned]
         rise = after.log_level - before.log_level
         for column, by_logarithm in element.gains:
             if by_logarithm:

@@ -104,6 +104,18 @@ def test_prior_draws_are_not_surprising():
     assert min(surprises(drawn(WALKERS, 5)).values()) > 1e-3
 
 
+@pytest.mark.parametrize("name", ["ShapeMove", "OrderSlide", "OrderRoam"])
+def test_a_walker_with_two_terms_alike_stays_for_other_moves(name: str):
+    """Ratios do not fix its times: the volume that they span is 0, at both ends where a proposal is void."""
+    here, others, random = drawn(200, 6), drawn(200, 7), np.random.RandomState(np.random.MT19937(1))
+    for kind in ("time", "order"):
+        here[:100, column(kind, 0, 1)] = here[:100, column(kind, 0, 0)]
+    found = [made(name).proposal(here, others, random)[1] for _ in range(20)]
+    assert any(np.isneginf(factor[:100]).any() for factor in found)
+    assert not any(np.isnan(factor).any() or np.isposinf(factor).any() for factor in found)
+    assert all(np.isfinite(factor[100:]).any() for factor in found)
+
+
 @pytest.mark.parametrize("name", ["MixtureMove", "MixtureWalk"])
 def test_a_walker_at_an_end_of_a_range_has_no_chart(name: str):
     """It stays for other moves; that was a warning of numpy, and ended a comparison in the tests."""
