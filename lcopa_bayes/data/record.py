@@ -104,6 +104,17 @@ class Record:
         """Times of rows in which some response was sampled, (n,) [time_unit]."""
         return self.time[np.isfinite(self.response).any(axis=1)]
 
+    def begun(self, drive: Vector) -> Record:
+        """The record after an early row with that `drive`, (drives,), and no response: what the plant rested
+        under."""
+        period = float(np.median(np.diff(self.time)))
+        return replace(
+            self,
+            time=np.concatenate([[self.time[0] - period], self.time]),
+            drive=np.vstack([drive, self.drive]),
+            response=np.vstack([np.full(self.response.shape[1], np.nan), self.response]),
+        )
+
     def __repr__(self) -> str:
         """What it holds, without the numbers."""
         axes = ", ".join(

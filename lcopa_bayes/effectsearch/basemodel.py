@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
@@ -93,18 +92,8 @@ def _begun(study: Study, level: Vector) -> Study:
     """All records with an early row of that drive and no response."""
     return replace(
         study,
-        fit=tuple(_after(one, level) for one in study.fit),
-        held_out=tuple(_after(one, level) for one in study.held_out),
-    )
-
-
-def _after(record: Record, level: Vector) -> Record:
-    period = float(np.median(np.diff(record.time)))
-    return replace(
-        record,
-        time=np.concatenate([[record.time[0] - period], record.time]),
-        drive=np.vstack([level, record.drive]),
-        response=np.vstack([np.full(record.response.shape[1], np.nan), record.response]),
+        fit=tuple(one.begun(level) for one in study.fit),
+        held_out=tuple(one.begun(level) for one in study.held_out),
     )
 
 

@@ -31,6 +31,7 @@ from lcopa_bayes.model.stepresponse import denominator
 from lcopa_bayes.results.bands import LEVELS
 from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.results.residuals import WHITE_P, Residual
+from lcopa_bayes.results.restbefore import rest_before
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.crosscheck import holm
 from lcopa_bayes.sampling.draws import Draws
@@ -217,6 +218,7 @@ def limitations(
             [_coverage(problem, draws, b, rng) for b in fitted],
         ),
         *_unpredicted([band for band in shown if band.held_out]),
+        *rest_before(problem, draws),
         *_above_rest(problem, fitted),
         *_ends(problem, draws),
         *resonances(draws, problem.scales.period, problem.study.time_unit),

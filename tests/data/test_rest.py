@@ -83,19 +83,9 @@ def test_an_early_row_states_what_the_plant_rested_under():
     assert "record 'step': response 'y' moves by " in str(problem)
     assert "while the drive stays as in the first row (u = 1 V) until " in str(problem)
     for level in (0.0, 1.0):
-        assert not_at_rest([begun(record, level)]) == []
-    (problem,) = not_at_rest([begun(record, 0.0)], [replace(record, name="apart")])
+        assert not_at_rest([record.begun(np.array([level]))]) == []
+    (problem,) = not_at_rest([record.begun(np.zeros(1))], [replace(record, name="apart")])
     assert "record 'apart'" in str(problem)
-
-
-def begun(record: Record, level: float) -> Record:
-    """The record with an early row of this drive and no response."""
-    return replace(
-        record,
-        time=np.r_[record.time[0] - 1.0, record.time],
-        drive=np.vstack(([level], record.drive)),
-        response=np.vstack(([np.nan], record.response)),
-    )
 
 
 def test_a_readback_that_jitters_is_no_change_of_the_drive():

@@ -1,0 +1,198 @@
+"""What the plant rested under before a record that shows no rest: was it the drive of the first row?
+
+Before its first row a plant is taken to rest under the drive of that row (`data.requirements` examines
+records that are sampled at rest). In a record whose drive moves at once nothing shows that. Another drive
+before it adds ``(u - u_0) K (1 - step response)`` to the response. Such drives are fitted to all records of
+this kind, together with the parameters, by Gauss-Newton steps under the noise of the optimum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.stats import chi2
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.wording import listed
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.crosscheck import holm
+from lcopa_bayes.sampling.draws import Draws
+
+MOVED = 0.5
+"""Shift of a parameter by other drives before records from which they limit the numbers [posterior sd]."""
+_RARE = 1e-3
+"""p-value from which another drive explains the start of a record better, all records together [-]."""
+_FEWEST = 8
+"""Samples at rest from which these show whether a record begins there [-]."""
+_FLAT = 1e-9
+"""Relative size of slopes below which a drive cannot be seen in a record [-]."""
+_STARTS, _STREAM = 3, 19
+"""Starts of the search for the optimum beside the first levels, and what marks their randomness [-]."""
+_STEPS, _SETTLED, _FAR = 8, 0.01, 3.0
+"""Gauss-Newton steps at most; size of one, over the largest drive, that ends them [-]; and largest difference
+of a drive from that of the first row, over its range in the records, that is believed [-]."""
+
+
+def rest_before(problem: Problem, draws: Draws) -> Iterator[Limitation]:
+    """A limitation by the record whose start another drive before it explains best, where these drives move
+    a parameter; none of a plant with effects, or under noise that is not Gaussian."""
+    posterior = problem.posterior
+    unknown = [r for r, samples in enumerate(posterior.samples) if _unknown(samples)]
+    if not unknown or posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
+        return
+    best = draws.flat[[int(draws.log_density.argmax())]]
+    values = posterior.complete(posterior.coordinates(best), None)[0]
+    none = np.zeros((len(unknown), len(problem.study.drive_axes)))
+    start = _Begun.at(problem, unknown, none, values)
+    surprises = start.surprises(start.step)
+    if min(holm(surprises)) >= _RARE:
+        return
+    found = start.settled()
+    if found is not None:
+        surprises = found.surprises(found.levels)
+    adjusted = holm(surprises)
+    worst = int(np.argmin(adjusted))
+    record, said = problem.study.fit[unknown[worst]], f"explains its start better (p = {adjusted[worst]:.1g})"
+    if found is None:
+        yield _limitation(record, f"another drive before it {said}", "the right")
+    elif adjusted[worst] < _RARE and (shift := start.shift(found)).max() > MOVED:
+        drive = record.drive[0] + found.levels[worst] * found.ranges
+        pairs = zip(record.drive_axes, drive, strict=True)
+        levels = listed([f"{axis.name} = {value:.4g} {axis.unit}" for axis, value in pairs])
+        name = posterior.table.names[start.own.columns[int(shift.argmax())]]
+        said = f"{levels} {said} and moves {name} by {shift.max():.1f} posterior sd"
+        yield _limitation(record, said, "that")
+
+
+def _unknown(samples: Samples) -> bool:
+    """Whether neither an early row nor samples at rest say what the plant rested under."""
+    if np.isnan(samples.record.response[0]).all():
+        return False
+    return max(samples.quiet(axis).values.size for axis in range(len(samples.axes))) < _FEWEST
+
+
+def _limitation(record: Record, said: str, which: str) -> Limitation:
+    early = f"{record.time[0] - float(np.median(np.diff(record.time))):.6g} {record.time_unit}"
+    return Limitation(
+        "tentative",
+        f"intervals hold only if the plant rested under the drive of the first row before {record.name}, "
+        f"which moves at once: {said}",
+        f"add a row before the first (time {early}, {which} drive, empty responses), or let `loop` fit a "
+        "drive before all records",
+    )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """The optimum of a study in which some records begin after another drive than that of their first row."""
+
+    problem: Problem
+    records: Sequence[int]
+    levels: Matrix
+    """Those drives less that of the first row, over the range of the drive, (records, drives) [-]."""
+    own: LeastSquares
+    """Of these records."""
+    values: Vector
+    """Table values, (rows,)."""
+
+    @classmethod
+    def at(
+        cls, problem: Problem, records: Sequence[int], levels: Matrix, values: Vector, *, starts: int = 0
+    ) -> _Begun:
+        """The optimum that a descent from some values reaches; `starts`, further ones, which may find a
+        better one."""
+        own = _after(problem, records, levels)
+        found = own.solve(values)[0]
+        if starts:
+            rng = np.random.default_rng([problem.study.seed, _STREAM])
+            optima = find_optima(own.posterior, rng, starts=starts, near=[found])
+            found = optima[0].values if optima else found
+        return cls(problem, records, levels, own, found)
+
+    def settled(self) -> _Begun | None:
+        """The levels that explain the records best; None where they are too far away to be found."""
+        found, starts = self, _STARTS  # beside wrong levels the optimum is often another one
+        for _ in range(_STEPS):
+            step = found.step
+            levels = found.levels + step
+            largest = np.abs(levels).max()
+            if largest >= _FAR:
+                return None
+            found = _Begun.at(self.problem, self.records, levels, found.values, starts=starts)
+            if (np.abs(step) < _SETTLED * largest).all():  # the noise there is that of another residual
+                return _Begun.at(self.problem, self.records, levels, found.values, starts=1)
+            starts = 0
+        return None
+
+    @property
+    def ranges(self) -> Vector:
+        """Of the drives in all records, (drives,) [drive unit]."""
+        return _ranges(self.problem)
+
+    @cached_property
+    def _linear(self) -> tuple[Matrix, Vector, Matrix]:
+        """Covariance of the parameters; the residual beyond their slopes; and the slopes of the levels beyond
+        these, (samples, records * drives)."""
+        x = self.own.coordinates(self.values)
+        residual, jacobian = self.own.residual(x, self.values)
+        basis, triangle = np.linalg.qr(np.vstack([jacobian, np.diag(np.sqrt(self.own.prior_precision))]))
+        left, columns = np.zeros(len(basis)), np.zeros((len(basis), *self.levels.shape))
+        left[: residual.size] = residual
+        sizes = [sum(axis.values.size for axis in one.axes) for one in self.problem.posterior.samples]
+        ends = np.cumsum([0, *sizes])
+        for drive, unit in enumerate(np.eye(self.levels.shape[1])):
+            other = _after(self.problem, self.records, self.levels + unit)
+            change = other.misfit(x, self.values) - residual  # of a record by its own level alone
+            for k, r in enumerate(self.records):
+                columns[ends[r] : ends[r + 1], k, drive] = change[ends[r] : ends[r + 1]]
+        flat = columns.reshape(len(basis), -1)
+        covariance = np.linalg.pinv(triangle.T @ triangle, hermitian=True)
+        return covariance, left - basis @ (basis.T @ left), flat - basis @ (basis.T @ flat)
+
+    @property
+    def step(self) -> Matrix:
+        """To the levels that explain the records best, (records, drives) [-]."""
+        _, left, columns = self._linear
+        step = np.linalg.lstsq(columns, -left, rcond=_FLAT)[0]
+        return np.asarray(step.reshape(self.levels.shape))
+
+    def surprises(self, levels: Matrix) -> list[float]:
+        """p-value of each record's first row as the drive before it, at fitted levels (Wald 1943, Trans. Am.
+        Math. Soc. 54)."""
+        columns = self._linear[2]
+        covariance = np.linalg.pinv(columns.T @ columns, rcond=_FLAT, hermitian=True)
+        count, drives = levels.shape
+        blocks = covariance.reshape(count, drives, count, drives)
+        inverses = [np.linalg.pinv(blocks[k, :, k, :], hermitian=True) for k in range(count)]
+        powers = [one @ inverse @ one for one, inverse in zip(levels, inverses, strict=True)]
+        return [float(chi2.sf(power, drives)) for power in powers]
+
+    def shift(self, other: _Begun) -> Vector:
+        """How far each search coordinate moves to another optimum, (k,) [posterior sd]."""
+        sd = np.sqrt(np.diag(self._linear[0]))
+        apart = np.abs(self.own.coordinates(other.values) - self.own.coordinates(self.values))
+        return np.asarray(np.divide(apart, sd, out=np.zeros_like(apart), where=sd > 0))
+
+
+def _ranges(problem: Problem) -> Vector:
+    return np.asarray(np.ptp(np.concatenate([one.drive for one in problem.study.fit]), axis=0))
+
+
+def _after(problem: Problem, records: Sequence[int], levels: Matrix) -> LeastSquares:
+    """The least-squares problem with these records after other drives, by `levels` as in `_Begun`."""
+    fitted = list(problem.study.fit)
+    for r, level in zip(records, levels, strict=True):
+        fitted[r] = fitted[r].begun(fitted[r].drive[0] + level * _ranges(problem))
+    samples, model = problem.simulated(fitted)
+    return LeastSquares(replace(problem.posterior, samples=samples, model=model))
