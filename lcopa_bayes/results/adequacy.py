@@ -210,7 +210,8 @@ def limitations(
     rng: np.random.Generator,
 ) -> tuple[Limitation, ...]:
     """Limitations of the numbers of a fit, from its bands and residuals."""
-    fitted = [band for band in shown if not band.held_out]
+    fitted, posterior = [band for band in shown if not band.held_out], problem.posterior
+    best = posterior.coordinates(draws.flat[[int(draws.log_density.argmax())]])
     return (
         *_disagreeing(problem.study),
         *_unexplained(
@@ -218,7 +219,7 @@ def limitations(
             [_coverage(problem, draws, b, rng) for b in fitted],
         ),
         *_unpredicted([band for band in shown if band.held_out]),
-        *rest_before(problem, draws),
+        *rest_before(problem, posterior.complete(best, None)[0]),
         *_above_rest(problem, fitted),
         *_ends(problem, draws),
         *resonances(draws, problem.scales.period, problem.study.time_unit),

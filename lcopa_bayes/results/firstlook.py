@@ -29,8 +29,10 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.discretisation import optima_of
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.residuals import WHITE_P, Residual, residuals
+from lcopa_bayes.results.restbefore import rest_before
 from lcopa_bayes.results.summary import fixed_values, scores
 from lcopa_bayes.results.tables import data_tables
+from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.importanceweights import effective, smoothed
 
@@ -74,6 +76,8 @@ class FirstLook:
     """50 and 90 % bands of every response axis of every record, fitted ones first [response unit]."""
     residuals: tuple[Residual, ...]
     """What the optimum leaves of each of these [response unit], tested for whiteness."""
+    before: tuple[Limitation, ...]
+    """Whether another drive before a record explains its start better."""
 
     @property
     def optimum(self) -> Optimum:
@@ -112,6 +116,7 @@ class FirstLook:
                 else "The noise model does not explain the residual"
             )
             parts[-1] += f" (smallest p = {smallest:.2g})."
+        parts += [f"{one.reason[0].upper()}{one.reason[1:]}; {one.remedy}." for one in self.before]
         return " ".join([f"Grade {GRADE}: {self.reason}.", *parts, "`fit` samples the posterior."])
 
     def to_json(self) -> dict[str, Any]:
@@ -189,7 +194,8 @@ def look_at(problem: Problem, optima: tuple[Optimum, ...]) -> FirstLook:
     same = np.tile(optima[0].values, (1, 4, 1))  # a simultaneous band needs four draws
     best = Draws(posterior.table, same, np.zeros((1, 4)), (), 1.0)
     remaining = residuals(best, study_bands(problem, best), posterior.noise, problem.scales.period)
-    return FirstLook(problem, optima, draws, share, tuple(shown), tuple(remaining))
+    before = tuple(rest_before(problem, optima[0].values))
+    return FirstLook(problem, optima, draws, share, tuple(shown), tuple(remaining), before)
 
 
 def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> tuple[Draws, float]:

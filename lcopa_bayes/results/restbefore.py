@@ -26,7 +26,6 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.crosscheck import holm
-from lcopa_bayes.sampling.draws import Draws
 
 MOVED = 0.5
 """Shift of a parameter by other drives before records from which they limit the numbers [posterior sd]."""
@@ -43,29 +42,29 @@ _STEPS, _SETTLED, _FAR = 8, 0.01, 3.0
 of a drive from that of the first row, over its range in the records, that is believed [-]."""
 
 
-def rest_before(problem: Problem, draws: Draws) -> Iterator[Limitation]:
+def rest_before(problem: Problem, values: Vector) -> Iterator[Limitation]:
     """A limitation by the record whose start another drive before it explains best, where these drives move
-    a parameter; none of a plant with effects, or under noise that is not Gaussian."""
+    a parameter; none of a plant with effects, or under noise that is not Gaussian.
+
+    `values` (rows,) of the table are near the optimum.
+    """
     posterior = problem.posterior
     unknown = [r for r, samples in enumerate(posterior.samples) if _unknown(samples)]
     if not unknown or posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
         return
-    best = draws.flat[[int(draws.log_density.argmax())]]
-    values = posterior.complete(posterior.coordinates(best), None)[0]
     none = np.zeros((len(unknown), len(problem.study.drive_axes)))
     start = _Begun.at(problem, unknown, none, values)
-    surprises = start.surprises(start.step)
-    if min(holm(surprises)) >= _RARE:
+    adjusted, found = holm(start.surprises(start.step)), start
+    if min(adjusted) >= _RARE:
         return
-    found = start.settled()
-    if found is not None:
-        surprises = found.surprises(found.levels)
-    adjusted = holm(surprises)
+    settled = start.settled()
+    if settled is not None and min(there := holm(settled.surprises(settled.levels))) < _RARE:
+        adjusted, found = there, settled
     worst = int(np.argmin(adjusted))
     record, said = problem.study.fit[unknown[worst]], f"explains its start better (p = {adjusted[worst]:.1g})"
-    if found is None:
+    if found is start:  # beside the wrong drive the optimum is another one
         yield _limitation(record, f"another drive before it {said}", "the right")
-    elif adjusted[worst] < _RARE and (shift := start.shift(found)).max() > MOVED:
+    elif (shift := start.shift(found)).max() > MOVED:
         drive = record.drive[0] + found.levels[worst] * found.ranges
         pairs = zip(record.drive_axes, drive, strict=True)
         levels = listed([f"{axis.name} = {value:.4g} {axis.unit}" for axis, value in pairs])

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from small import TRUTH, draws_of, problem, record
+from small import TRUTH, problem, record, study
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.results.restbefore import rest_before
 from lcopa_bayes.sampling.convergence import Limitation
 
@@ -30,10 +31,10 @@ def moving(seed: int, rest: float | None) -> Record:
 
 
 def found(made: Problem) -> list[Limitation]:
-    """Limitations of draws at the truth; the search moves them to the optimum."""
+    """Limitations at the truth; the search moves it to the optimum."""
     rows = made.posterior.table.rows
     truth = np.array([TRUTH[row.name.removesuffix("_second")] if row.free else row.value for row in rows])
-    return list(rest_before(made, draws_of(made.posterior.table, np.tile(truth, (4, 1)))))
+    return list(rest_before(made, truth))
 
 
 def test_the_drive_before_the_record_is_found():
@@ -71,3 +72,9 @@ def test_the_record_that_did_not_rest_is_named():
     first, second = moving(1, None), replace(moving(2, 1.0), name="second")
     (limit,) = found(problem(first, second, noise="white", offset="shared"))
     assert "before second, which moves at once" in limit.reason
+
+
+def test_the_first_look_says_so():
+    said = first_look(study(moving(1, 1.0), noise="white")).verdict
+    assert "Intervals hold only if the plant rested under the drive of the first row before step" in said
+    assert "; add a row before the first (time -" in said
