@@ -50,7 +50,7 @@ STAGES = {
     "lcopa_bayes.verbs.sources": {"load_study": "reading"},
     "lcopa_bayes.results.fit": {
         "problem_of": "reading",
-        "unmet": "reading",
+        "obstacles": "reading",
         "optima_of": "least squares",
         "resolved_optima": "refinement check",
         "weighted_run": "search and draws",
