@@ -77,6 +77,7 @@ def test_numbers_do_not_depend_on_the_number_of_processes(pools, quiet):
     assert two.after.state.model.plant is two.before.state.model.plant  # no copy comes back
 
 
+@pytest.mark.slow
 def test_a_richer_structure_is_the_same_too(pools):
     one, two = (loop(study(2), library=LIBRARY, jobs=jobs, sample=False, quick=True) for jobs in (1, 2))
     assert pools == [2]

@@ -57,6 +57,7 @@ def looped(study, *names):
     return loop(study, library=library, sample=False, quick=True, as_stated=True)
 
 
+@pytest.mark.slow
 def test_a_phase_that_moves_with_the_delay_stays_where_it_is_likely():
     found = looped(study_of(held=True), "refresh_hold", "trigger_jitter", "unmodelled_linear")
     assert [effect.name for effect in found.effects] == ["refresh_hold"]

@@ -16,6 +16,7 @@ from lcopa_bayes.model.effects.parallel import MissingCrossPath
 from lcopa_bayes.model.effects.response import Clipping
 
 
+@pytest.mark.slow
 def test_a_limit_is_found_from_a_part_of_a_lower_one():
     rng = np.random.default_rng([42002, 77])
     made = campaign(drawn(("clipping",), rng), rng)

@@ -117,6 +117,7 @@ def slab(seed: int) -> tuple[LagSearch, ...]:
     )
 
 
+@pytest.mark.slow
 def test_a_wall_is_drawn_where_it_follows_the_records_best() -> None:
     """Its delay, which draws of lags alone put further away."""
     searches = slab(0)

@@ -39,6 +39,7 @@ def ends(found: Loop, name: str) -> tuple[float, float]:
     return float(quantile(one.values, 0.05)), float(quantile(one.values, 0.95))
 
 
+@pytest.mark.slow
 def test_a_steady_value_beyond_the_record_is_held(found: Loop) -> None:
     """By the interval over the plant that was not chosen too, and not by that of the others."""
     true = truths(campaign(KIND, (), SEED), found.problem.scales.span, ())["steady_state[y1]"]
