@@ -107,13 +107,23 @@ class Record:
     def begun(self, drive: Vector) -> Record:
         """The record after an early row with that `drive`, (drives,), and no response: what the plant rested
         under."""
-        period = float(np.median(np.diff(self.time)))
         return replace(
             self,
-            time=np.concatenate([[self.time[0] - period], self.time]),
+            time=np.concatenate([[self._before], self.time]),
             drive=np.vstack([drive, self.drive]),
             response=np.vstack([np.full(self.response.shape[1], np.nan), self.response]),
         )
+
+    @property
+    def early_row(self) -> str:
+        """How an early row with another drive is added, a clause."""
+        at = f"{self._before:.6g} {self.time_unit}"
+        return f"add a row before the first (time {at}, that drive, empty responses)"
+
+    @property
+    def _before(self) -> float:
+        """Time of a row before the first [time_unit]."""
+        return float(self.time[0] - np.median(np.diff(self.time)))
 
     def __repr__(self) -> str:
         """What it holds, without the numbers."""

@@ -38,7 +38,7 @@ _SHARE = 0.1
 """Least movement that counts, over the range of the response in the records [-]."""
 _UNMOVED = 0.01
 """Deviation of a drive from its first row that counts as no change, over its range in the records [-]."""
-_FEWEST = 8
+FEWEST = 8
 """Fewer samples cannot distinguish a relaxation from noise [-]."""
 _MEANS = 24
 """Means of neighbours that a long stretch is reduced to, at most twice as many [-]."""
@@ -101,12 +101,7 @@ class Movement(NamedTuple):
 
     @property
     def _advice(self) -> str:
-        time = self.record.time
-        return (
-            "If the drive was another one before the record, add a row before the first (time "
-            f"{time[0] - float(np.median(np.diff(time))):.6g} {self.record.time_unit}, that drive, empty "
-            "responses)"
-        )
+        return f"If the drive was another one before the record, {self.record.early_row}"
 
 
 _STRAIGHT = "It moves along a straight line, as a drift does"
@@ -128,7 +123,7 @@ def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[
         for axis, span in enumerate(spans):
             late = moved_with_drive(record, axis) != 0.0  # `agreement` says so
             seen = np.flatnonzero(np.isfinite(record.response[: until - late, axis]))
-            if seen.size < _FEWEST or not span > 0.0:
+            if seen.size < FEWEST or not span > 0.0:
                 continue
             times, values = record.time[seen], record.response[seen, axis]
             moved = unrest(times, values, float(span))
@@ -166,7 +161,7 @@ def straight(time: Vector, values: Vector, span: float) -> bool:
 
 def drifts(time: Vector, values: Vector) -> bool:
     """Whether samples (n,) of a response that nothing drives move, of any size, and along a straight line."""
-    span = float(np.ptp(values)) if values.size >= _FEWEST else 0.0
+    span = float(np.ptp(values)) if values.size >= FEWEST else 0.0
     return span > 0.0 and unrest(time, values, span) is not None and straight(time, values, span)
 
 
@@ -220,14 +215,16 @@ _SCALE = 1e100
 """Ranges beyond it, or below its inverse, overflow once squared and divided by each other [any unit]."""
 
 
-def unmet(study: Study, *, drifts: bool = False) -> list[str]:
-    """A problem for everything in the records that keeps a fit of them from meaning anything.
+def unmet(study: Study, *, described: bool = False) -> list[str]:
+    """A problem for everything in the records that keeps a fit of them from meaning anything; `described` as
+    `unmet_rest`."""
+    return unmet_apart_from_rest(study) or unmet_rest(study, described=described)
 
-    `drifts`: an effect of the study describes responses that drift where no drive moves.
-    """
-    if problems := unmet_apart_from_rest(study):
-        return problems
-    return [str(one) for one in not_at_rest(study.fit, study.held_out) if not (drifts and one.straight)]
+
+def unmet_rest(study: Study, *, described: bool) -> list[str]:
+    """A problem for every response that moves before a drive does; `described`, but for drifts where no drive
+    moves, which an effect describes."""
+    return [str(one) for one in not_at_rest(study.fit, study.held_out) if not (described and one.straight)]
 
 
 def unmet_apart_from_rest(study: Study) -> list[str]:

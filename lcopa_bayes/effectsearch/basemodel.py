@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
+from lcopa_bayes.data.requirements import unmet_apart_from_rest, unmet_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
@@ -168,9 +168,7 @@ def fitted_base(
         rival = _explained(separate[0], library, np.random.default_rng([study.seed, 14]), draws, crew)
         mended = mended if mended is None or mended.power < rival else None
     if mended is None:
-        drifts = any(kind.card.resting for kind in library)
-        moving = not_at_rest(study.fit, study.held_out)
-        refuse_if([str(one) for one in moving if not (drifts and one.straight)])
+        refuse_if(unmet_rest(study, described=any(kind.card.resting for kind in library)))
     else:
         study = replace(mended.study, model=study.model)
         base = _based(study, crew=crew)._replace(sentence=mended.sentence)

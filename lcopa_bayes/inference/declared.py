@@ -80,7 +80,9 @@ def obstacles(study: Study) -> list[str]:
     """What keeps a fit of a study's records from meaning anything (`requirements`), given its effects: one
     that goes on at rest describes a response that drifts where no drive moves."""
     known = catalogue(study.effects.add, study.folder) if study.effects.use else {}
-    return unmet(study, drifts=any(known[name].card.resting for name in study.effects.use if name in known))
+    return unmet(
+        study, described=any(known[name].card.resting for name in study.effects.use if name in known)
+    )
 
 
 def _counted(count: int, what: str) -> str:

@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.requirements import FEWEST
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -31,8 +32,6 @@ MOVED = 0.5
 """Shift of a parameter by other drives before records from which they limit the numbers [posterior sd]."""
 _RARE = 1e-3
 """p-value from which another drive explains the start of a record better, all records together [-]."""
-_FEWEST = 8
-"""Samples at rest from which these show whether a record begins there [-]."""
 _FLAT = 1e-9
 """Relative size of slopes below which a drive cannot be seen in a record [-]."""
 _STARTS, _STREAM = 3, 19
@@ -63,31 +62,29 @@ def rest_before(problem: Problem, values: Vector) -> Iterator[Limitation]:
     worst = int(np.argmin(adjusted))
     record, said = problem.study.fit[unknown[worst]], f"explains its start better (p = {adjusted[worst]:.1g})"
     if found is start:  # beside the wrong drive the optimum is another one
-        yield _limitation(record, f"another drive before it {said}", "the right")
+        yield _limitation(record, f"another drive before it {said}")
     elif (shift := start.shift(found)).max() > MOVED:
-        drive = record.drive[0] + found.levels[worst] * found.ranges
+        drive = record.drive[0] + found.levels[worst] * _ranges(problem)
         pairs = zip(record.drive_axes, drive, strict=True)
         levels = listed([f"{axis.name} = {value:.4g} {axis.unit}" for axis, value in pairs])
         name = posterior.table.names[start.own.columns[int(shift.argmax())]]
         said = f"{levels} {said} and moves {name} by {shift.max():.1f} posterior sd"
-        yield _limitation(record, said, "that")
+        yield _limitation(record, said)
 
 
 def _unknown(samples: Samples) -> bool:
     """Whether neither an early row nor samples at rest say what the plant rested under."""
     if np.isnan(samples.record.response[0]).all():
         return False
-    return max(samples.quiet(axis).values.size for axis in range(len(samples.axes))) < _FEWEST
+    return max(samples.quiet(axis).values.size for axis in range(len(samples.axes))) < FEWEST
 
 
-def _limitation(record: Record, said: str, which: str) -> Limitation:
-    early = f"{record.time[0] - float(np.median(np.diff(record.time))):.6g} {record.time_unit}"
+def _limitation(record: Record, said: str) -> Limitation:
     return Limitation(
         "tentative",
         f"intervals hold only if the plant rested under the drive of the first row before {record.name}, "
         f"which moves at once: {said}",
-        f"add a row before the first (time {early}, {which} drive, empty responses), or let `loop` fit a "
-        "drive before all records",
+        f"{record.early_row}, or let `loop` fit a drive before all records",
     )
 
 
@@ -133,11 +130,6 @@ class _Begun:
                 return _Begun.at(self.problem, self.records, levels, found.values, starts=1)
             starts = 0
         return None
-
-    @property
-    def ranges(self) -> Vector:
-        """Of the drives in all records, (drives,) [drive unit]."""
-        return _ranges(self.problem)
 
     @cached_property
     def _linear(self) -> tuple[Matrix, Vector, Matrix]:
@@ -185,13 +177,14 @@ class _Begun:
 
 
 def _ranges(problem: Problem) -> Vector:
+    """Of the drives in all records, (drives,) [drive unit]."""
     return np.asarray(np.ptp(np.concatenate([one.drive for one in problem.study.fit]), axis=0))
 
 
 def _after(problem: Problem, records: Sequence[int], levels: Matrix) -> LeastSquares:
     """The least-squares problem with these records after other drives, by `levels` as in `_Begun`."""
     fitted = list(problem.study.fit)
-    for r, level in zip(records, levels, strict=True):
-        fitted[r] = fitted[r].begun(fitted[r].drive[0] + level * _ranges(problem))
+    for r, change in zip(records, levels * _ranges(problem), strict=True):
+        fitted[r] = fitted[r].begun(fitted[r].drive[0] + change)
     samples, model = problem.simulated(fitted)
     return LeastSquares(replace(problem.posterior, samples=samples, model=model))
