@@ -1,9 +1,10 @@
-"""What the plant rested under before a record that shows no rest: was it the drive of the first row?
+"""What the plant rested under before a record: was it the drive of the first row?
 
-Before its first row a plant is taken to rest under the drive of that row (`data.requirements` examines
-records that are sampled at rest). In a record whose drive moves at once nothing shows that. Another drive
-before it adds ``(u - u_0) K (1 - step response)`` to the response. Such drives are fitted to all records of
-this kind, together with the parameters, by Gauss-Newton steps under the noise of the optimum.
+Before its first row a plant is taken to rest under the drive of that row. `data.requirements` refuses a
+response that moves by a tenth of its range before a drive does; one that moves by less, and a record whose
+drive moves at once, pass there. Another drive before a record adds ``(u - u_0) K (1 - step response)`` to the
+response. Such drives are fitted to all records that do not state one, together with the parameters, by
+Gauss-Newton steps under the noise of the optimum. Where a record has samples at rest, these have to agree.
 """
 
 from __future__ import annotations
@@ -16,9 +17,8 @@ from typing import final
 import numpy as np
 from scipy.stats import chi2
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.wording import listed
-from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import FEWEST
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -53,38 +53,46 @@ def rest_before(problem: Problem, values: Vector) -> Iterator[Limitation]:
         return
     none = np.zeros((len(unknown), len(problem.study.drive_axes)))
     start = _Begun.at(problem, unknown, none, values)
-    adjusted, found = holm(start.surprises(start.step)), start
+    adjusted, found = holm(start.surprises(start.step, start.left, start.left_beyond(start.step))), start
     if min(adjusted) >= _RARE:
         return
     settled = start.settled()
-    if settled is not None and min(there := holm(settled.surprises(settled.levels))) < _RARE:
-        adjusted, found = there, settled
+    if settled is not None:
+        there = holm(settled.surprises(settled.levels, start.left, settled.left))
+        if min(there) < _RARE:
+            adjusted, found = there, settled
     worst = int(np.argmin(adjusted))
-    record, said = problem.study.fit[unknown[worst]], f"explains its start better (p = {adjusted[worst]:.1g})"
+    one, said = posterior.samples[unknown[worst]], f"explains its start better (p = {adjusted[worst]:.1g})"
+    record = one.record
     if found is start:  # beside the wrong drive the optimum is another one
-        yield _limitation(record, f"another drive before it {said}")
+        yield _limitation(one, f"another drive before it {said}")
     elif (shift := start.shift(found)).max() > MOVED:
         drive = record.drive[0] + found.levels[worst] * _ranges(problem)
         pairs = zip(record.drive_axes, drive, strict=True)
         levels = listed([f"{axis.name} = {value:.4g} {axis.unit}" for axis, value in pairs])
         name = posterior.table.names[start.own.columns[int(shift.argmax())]]
         said = f"{levels} {said} and moves {name} by {shift.max():.1f} posterior sd"
-        yield _limitation(record, said)
+        yield _limitation(one, said)
 
 
 def _unknown(samples: Samples) -> bool:
-    """Whether neither an early row nor samples at rest say what the plant rested under."""
-    if np.isnan(samples.record.response[0]).all():
-        return False
-    return max(samples.quiet(axis).values.size for axis in range(len(samples.axes))) < FEWEST
+    """Whether no early row says what the plant rested under. Where no drive changes, what moves may drift."""
+    return not np.isnan(samples.record.response[0]).all() and bool(np.isfinite(samples.first_change))
 
 
-def _limitation(record: Record, said: str) -> Limitation:
+def _resting(samples: Samples) -> list[int]:
+    """Samples at rest of each axis [-]; zero where there are too few to show it."""
+    counts = [samples.quiet(axis).values.size for axis in range(len(samples.axes))]
+    return counts if max(counts) >= FEWEST else [0] * len(counts)
+
+
+def _limitation(samples: Samples, said: str) -> Limitation:
+    seen = "whose response moves before its drive does" if any(_resting(samples)) else "which moves at once"
     return Limitation(
         "tentative",
-        f"intervals hold only if the plant rested under the drive of the first row before {record.name}, "
-        f"which moves at once: {said}",
-        f"{record.early_row}, or let `loop` fit a drive before all records",
+        "intervals hold only if the plant rested under the drive of the first row before "
+        f"{samples.record.name}, {seen}: {said}",
+        f"{samples.record.early_row}, or let `loop` fit a drive before all records",
     )
 
 
@@ -101,6 +109,11 @@ class _Begun:
     """Of these records."""
     values: Vector
     """Table values, (rows,)."""
+
+    @property
+    def samples(self) -> Sequence[Samples]:
+        """Of all records."""
+        return self.problem.posterior.samples
 
     @classmethod
     def at(
@@ -140,8 +153,7 @@ class _Begun:
         basis, triangle = np.linalg.qr(np.vstack([jacobian, np.diag(np.sqrt(self.own.prior_precision))]))
         left, columns = np.zeros(len(basis)), np.zeros((len(basis), *self.levels.shape))
         left[: residual.size] = residual
-        sizes = [sum(axis.values.size for axis in one.axes) for one in self.problem.posterior.samples]
-        ends = np.cumsum([0, *sizes])
+        ends = np.cumsum([0, *(sum(axis.values.size for axis in one.axes) for one in self.samples)])
         for drive, unit in enumerate(np.eye(self.levels.shape[1])):
             other = _after(self.problem, self.records, self.levels + unit)
             change = other.misfit(x, self.values) - residual  # of a record by its own level alone
@@ -158,16 +170,42 @@ class _Begun:
         step = np.linalg.lstsq(columns, -left, rcond=_FLAT)[0]
         return np.asarray(step.reshape(self.levels.shape))
 
-    def surprises(self, levels: Matrix) -> list[float]:
+    @property
+    def left(self) -> Vector:
+        """Residual beyond the slopes of the parameters, (samples and priors,) [noise sd]."""
+        return self._linear[1]
+
+    def left_beyond(self, step: Matrix) -> Vector:
+        """The same after a step of the levels, (records, drives)."""
+        return np.asarray(self.left + self._linear[2] @ step.ravel())
+
+    def surprises(self, levels: Matrix, before: Vector, after: Vector) -> list[float]:
         """p-value of each record's first row as the drive before it, at fitted levels (Wald 1943, Trans. Am.
-        Math. Soc. 54)."""
+        Math. Soc. 54). Of a record with samples at rest that of these alone where it is larger, by the fall
+        of their squares from a residual `before` the levels were fitted to one `after` it."""
         columns = self._linear[2]
         covariance = np.linalg.pinv(columns.T @ columns, rcond=_FLAT, hermitian=True)
         count, drives = levels.shape
         blocks = covariance.reshape(count, drives, count, drives)
         inverses = [np.linalg.pinv(blocks[k, :, k, :], hermitian=True) for k in range(count)]
         powers = [one @ inverse @ one for one, inverse in zip(levels, inverses, strict=True)]
+        squares = before**2 - after**2
+        for k, rows in enumerate(self._at_rest):
+            powers[k] = min(powers[k], squares[rows].sum()) if rows.size else powers[k]
         return [float(chi2.sf(power, drives)) for power in powers]
+
+    @property
+    def _at_rest(self) -> list[Index]:
+        """Positions of the samples at rest of each record in the residual."""
+        out, begin = [], 0
+        for r, one in enumerate(self.samples):
+            rows = list[int]()
+            for axis, count in zip(one.axes, _resting(one), strict=True):
+                rows += range(begin, begin + count)
+                begin += axis.values.size
+            if r in self.records:
+                out.append(np.array(rows, dtype=np.intp))
+        return out
 
     def shift(self, other: _Begun) -> Vector:
         """How far each search coordinate moves to another optimum, (k,) [posterior sd]."""
