@@ -33,6 +33,9 @@ _DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS = 3
+_OUT = 1.5
+"""Mean square of a residual that is no noise [variance of the noise]: where samples at rest know that to 20 %,
+noise alone stays below."""
 _SPARE = 3
 """Independent samples per parameter with which a residual can be judged at all [-]: with fewer the fit has
 followed more than a third of the noise that it is judged by."""
@@ -59,6 +62,13 @@ class BaseFit:
         """Whether the residual counts as too few independent samples to be judged: noise known from it alone
         holds what is missing too."""
         return self.optimum.converged and too_smooth(self.optimum)
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether more is left than noise: the plant lacks something, or the search ended beside its optimum."""
+        if not (self.noise_known and self.optimum.converged):
+            return self.smooth or not self.optimum.converged
+        return 2.0 * self.optimum.cost > _OUT * self.optimum.residual.size
 
     @property
     def noise_samples(self) -> tuple[int, ...]:

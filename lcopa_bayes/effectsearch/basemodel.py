@@ -159,7 +159,10 @@ def fitted_base(
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
-    base = _based(study, crew=crew)
+    based = partial(
+        _based, again=not alone, crew=crew
+    )  # else richer plants are searched for from more starts
+    base = based(study)
     separate = _apart(study, base, crew) if alone else (base, study)
     # paths that share too much look like a plant that did not rest
     mended = started(separate[1], separate[0].fit)
@@ -171,11 +174,11 @@ def fitted_base(
         refuse_if(unmet_rest(study, described=any(kind.card.resting for kind in library)))
     else:
         study = replace(mended.study, model=study.model)
-        base = _based(study, crew=crew)._replace(sentence=mended.sentence)
+        base = based(study)._replace(sentence=mended.sentence)
     later = _later(study, base.fit)
     if later is not None:
         study = later.study
-        base = _based(study, crew=crew)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
+        base = based(study)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
     if not alone:
         return base
     base, study = separate if mended is None and later is None else _apart(study, base, crew)
@@ -262,23 +265,33 @@ def _lifted(model: ExtendedModel, base: Base, rng: np.random.Generator) -> list[
     return [] if starts is None else [model.coordinates(each) for each in starts]
 
 
-def _based(study: Study, *key: int, contained: Base | None = None, crew: Crew = ALONE) -> Base:
+def _based(
+    study: Study,
+    *key: int,
+    contained: Base | None = None,
+    again: bool = False,
+    crew: Crew = ALONE,
+) -> Base:
     """A study's base fit as stated; `key` separates its random numbers from others'. It starts from the
-    optimum of a `contained` model too."""
+    optimum of a `contained` model too, and `again` from more starts where its residual stands out."""
     problem = problem_of(study)
-    fit = _fit(problem, key, contained, crew)
+    fit = _fit(problem, key, contained, again, crew)
     narrow = narrowed(problem, partial(_shift, fit))
     if narrow is not problem:
         problem = narrow
-        fit = _fit(problem, key, contained, crew)
+        fit = _fit(problem, key, contained, again, crew)
     return Base(problem, fit, _state(study, fit), "")
 
 
-def _fit(problem: Problem, key: Sequence[int], contained: Base | None, crew: Crew) -> BaseFit:
+def _fit(problem: Problem, key: Sequence[int], contained: Base | None, again: bool, crew: Crew) -> BaseFit:
     model, seed = ExtendedModel(problem.posterior), [problem.study.seed, 10, *key]
-    if contained is None:
-        return base_fit(model, np.random.default_rng(seed), crew=crew)
-    near = _lifted(model, contained, np.random.default_rng([*seed, 1]))
+    if contained is not None:
+        near = _lifted(model, contained, np.random.default_rng([*seed, 1]))
+    else:
+        fit = base_fit(model, np.random.default_rng(seed), crew=crew)
+        if not (again and fit.stands_out):
+            return fit
+        near = [fit.optimum.x]
     return base_fit(model, np.random.default_rng(seed), starts=_MORE_STARTS, near=near, crew=crew)
 
 

@@ -49,21 +49,21 @@ def mixed(seed: int) -> Record:
 
 @cache
 def based() -> Base:
-    """The fit of the first of a few seeds that finds the resonance: most end beside it, and rounding decides
-    which do."""
+    """A fit whose first search ends beside the resonance, at 80 times the noise, as most do."""
     model = ModelSettings(terms={"y_u1": 2, "y_u2": 1}, share="none", delay="path")
-    for seed in range(3, 11):
-        study = Study("mixed", None, "s", seed, (mixed(5), mixed(6)), (), model)
-        base = fitted_base(study, (), as_stated=True, draws=100)
-        plant = fitted_plant(base.start, base.problem)
-        if plant.square(0) < 3.0 * base.problem.posterior.size:
-            return base
-    raise AssertionError("no search found the resonance")
+    study = Study("mixed", None, "s", 3, (mixed(5), mixed(6)), (), model)
+    return fitted_base(study, (), as_stated=True, draws=100)
 
 
 @cache
 def found() -> tuple[Alternative, ...]:
     return lags_of(based().start, based().problem)
+
+
+def test_a_search_that_ends_beside_the_resonance_is_made_again():
+    optimum = based().fit.optimum
+    assert 2 * optimum.cost < 3 * optimum.residual.size
+    assert based().fit.stands_out  # the lags that it lacks are more than noise
 
 
 def test_the_path_that_is_no_element_has_lags_and_the_one_that_rings_none():
