@@ -34,8 +34,8 @@ _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS = 3
 _OUT = 1.5
-"""Mean square of a residual that is no noise [variance of the noise]: where samples at rest know that to 20 %,
-noise alone stays below."""
+"""Mean square of a residual that is more than noise [variance of the noise]: where samples at rest know that
+to 20 %, noise alone stays below."""
 _SPARE = 3
 """Independent samples per parameter with which a residual can be judged at all [-]: with fewer the fit has
 followed more than a third of the noise that it is judged by."""
@@ -65,7 +65,7 @@ class BaseFit:
 
     @property
     def stands_out(self) -> bool:
-        """Whether more is left than noise: the plant lacks something, or the search ended beside its optimum."""
+        """Whether more than noise is left: the plant lacks something, or the search ended beside."""
         if not (self.noise_known and self.optimum.converged):
             return self.smooth or not self.optimum.converged
         return 2.0 * self.optimum.cost > _OUT * self.optimum.residual.size

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -176,9 +177,19 @@ def _plant(fitted: Fit) -> FittedPlant | None:
     return FittedPlant(fitted.problem, best, noise, fitted.curves, fitted.run.plan.seed)
 
 
-def with_alternatives(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> Fit:
-    """A fit with the figures of its step responses over all plants, and what follows for its grade."""
-    own, integer = _plant(fitted), integer_fit(fitted, jobs=jobs, quick=quick)
+def with_alternatives(
+    fitted: Fit,
+    *,
+    jobs: int = 1,
+    folder: Path | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    quiet: bool = True,
+) -> Fit:
+    """A fit with the figures of its step responses over all plants, and what follows for its grade; the
+    parameters are those of `fit`."""
+    integer = integer_fit(fitted, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
+    own = _plant(fitted)
     found = lags_beside(own) if own else ()
     if not found and integer is None:
         return fitted

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -24,6 +25,8 @@ from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.fit import Fit, fit
 
+FOLDER = "integer"
+"""In the run folder of a fit, what is kept of them while they are sampled."""
 _PART = 0.02
 """Share of the draws below which integer orders have no part: they would move an end of a 90 % interval by no
 more than that share of the draws."""
@@ -77,9 +80,20 @@ class IntegerFit:
         }
 
 
-def integer_fit(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> IntegerFit | None:
+def integer_fit(
+    fitted: Fit,
+    *,
+    jobs: int = 1,
+    folder: Path | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    quiet: bool = True,
+) -> IntegerFit | None:
     """The plant of a fit with integer orders of all elements that the records let have them, sampled as that
-    was; None without any, or where its plant has effects."""
+    was; None without any, or where its plant has effects.
+
+    With `folder`, the run folder of the fit, `resume` goes on from what was sampled in its `integer`.
+    """
     posterior = fitted.problem.posterior
     if posterior.simulation is not None:
         return None
@@ -88,7 +102,15 @@ def integer_fit(fitted: Fit, *, jobs: int = 1, quick: bool = False) -> IntegerFi
     found = most_likely(orders, lambda own: _held(fitted, level, values, own))
     if found is None or found.weight < _PART:
         return None
-    return replace(found, sampled=fit(found.problem.study, jobs=jobs, quick=quick))
+    sampled = fit(
+        found.problem.study,
+        jobs=jobs,
+        folder=folder / FOLDER if folder else None,
+        resume=resume,
+        quick=quick,
+        quiet=quiet,
+    )
+    return replace(found, sampled=sampled)
 
 
 def _held(fitted: Fit, level: float, values: Vector, orders: Orders) -> IntegerFit | None:

@@ -72,7 +72,10 @@ def fit(
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
         if structure:
-            fitted = with_alternatives(replace(fitted, structure=structure), jobs=jobs, quick=quick)
+            fitted = replace(fitted, structure=structure)
+            fitted = with_alternatives(
+                fitted, jobs=jobs, folder=place, resume=resume, quick=quick, quiet=quiet
+            )
         if place is not None:
             fitted.save(place, compact=compact, jobs=jobs, page=page)
     return fitted

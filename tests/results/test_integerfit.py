@@ -43,8 +43,13 @@ def delay_of(of: Fit) -> Averaged:
 
 
 @pytest.fixture(scope="module")
-def over() -> Fit:
-    return with_alternatives(fitted(LAG, 1), quick=True)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("run")
+
+
+@pytest.fixture(scope="module")
+def over(folder: Path) -> Fit:
+    return with_alternatives(fitted(LAG, 1), folder=folder, quick=True)
 
 
 def agree(integer: IntegerFit, path: TransferPath, orders: Orders, terms: int) -> None:
@@ -89,6 +94,20 @@ def test_integer_orders_hold_what_free_ones_put_at_an_end() -> None:
 
 def test_a_fractional_order_leaves_no_integer_one() -> None:
     assert integer_fit(fitted(HALF, 1)) is None
+
+
+def test_a_killed_run_goes_on_from_what_was_sampled(
+    over: Fit, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begun(*_: object) -> None:
+        raise AssertionError("sampled from the start")
+
+    monkeypatch.setattr("lcopa_bayes.sampling.sampler.Birth", begun)
+    monkeypatch.setattr("lcopa_bayes.sampling.sampler.Search", begun)
+    resumed = integer_fit(over, folder=folder, resume=True, quick=True)
+    assert resumed is not None
+    drawn = (one.sampled.draws.flat for one in (resumed, parts(over)[1]) if one.sampled)
+    np.testing.assert_array_equal(*drawn)
 
 
 def test_they_are_kept_with_the_run(over: Fit, tmp_path: Path) -> None:
