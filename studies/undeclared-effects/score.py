@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from campaigns import Task, play
 from foreign import EFFECTS, KINDS
-from scoresheet import bounds, matrix, plants, sheet
+from scoresheet import bounds, matrix, plants, sheet, standing
 from tqdm import tqdm
 
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
@@ -107,6 +107,7 @@ def main() -> None:
         rows = list(tqdm(crew.finished(play, listed), total=len(listed), disable=options.quiet))
     rows.sort(key=lambda row: (row["kind"], row["effects"], row["seed"]))
     lines = sheet(rows, frozen_values["targets"], frozen_values["package"]["seen"])
+    lines = [line | {"standing": standing(line)} if line["trials"] else line for line in lines]
     values = {
         "seed": options.seed,
         "campaigns": len(rows),
@@ -137,11 +138,13 @@ def main() -> None:
 
 
 def _verdict(values: dict[str, Any]) -> Verdict:
-    missed = [
-        line["measure"] for line in values["sheet"] if line["value"] is not None and not line["reached"]
-    ]
-    said = f"Not reached: {'; '.join(missed)}." if missed else "Every target is reached."
-    grade = "tentative" if missed or bounds(0, values["campaigns"])[1] > 0.02 else "reliable"
+    missed, undecided = (
+        [line["measure"] for line in values["sheet"] if line.get("standing") == one] for one in ("no", "open")
+    )
+    parts = [f"Not reached: {'; '.join(missed)}."] if missed else []
+    parts += [f"Open, more campaigns decide: {'; '.join(undecided)}."] if undecided else []
+    said = " ".join(parts) or "Every target is reached."
+    grade = "tentative" if parts or bounds(0, values["campaigns"])[1] > 0.02 else "reliable"
     return Verdict(
         grade, said, "targets of the table below; thresholds were frozen before the seeds were drawn"
     )

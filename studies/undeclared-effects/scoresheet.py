@@ -80,6 +80,17 @@ def _reached(value: float, target: Any, side: str) -> bool:
     return bool(value <= target if side == "most" else value >= target)
 
 
+def standing(line: Row) -> str:
+    """Whether a line reaches its target: "yes", "no", or "open" where its value does not but its 95 %
+    interval does, so that more campaigns decide."""
+    if line["reached"] or "lower" not in line:
+        return "yes" if line["reached"] else "no"
+    least, most = {"within": line["target"], "least": (line["target"], 1.0), "most": (0.0, line["target"])}[
+        line["side"]
+    ]
+    return "open" if line["lower"] <= most and line["upper"] >= least else "no"
+
+
 def number(
     name: str, values: Sequence[float], reduce: Callable[..., Any], target: Any, side: str
 ) -> dict[str, Any]:

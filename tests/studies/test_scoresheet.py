@@ -194,3 +194,23 @@ def test_heavy_tails_by_their_name_are_no_alarm() -> None:
     assert not scoresheet.alarming(row | {"verdict": "clean", "named": []})
     assert scoresheet.alarming(row | {"named": ["vibration"]})
     assert scoresheet.alarming(row | {"verdict": "unexplained", "named": []})
+
+
+@pytest.mark.parametrize(
+    ("hits", "trials", "target", "side", "expected"),
+    [
+        (90, 100, [0.85, 0.95], "within", "yes"),
+        (15, 20, [0.85, 0.95], "within", "open"),  # 0.51 to 0.91
+        (60, 100, [0.85, 0.95], "within", "no"),
+        (300, 300, [0.85, 0.95], "within", "no"),  # 0.988 to 1
+        (5, 6, 0.9, "least", "open"),
+        (50, 100, 0.9, "least", "no"),
+        (1, 14, 0.05, "most", "open"),
+        (1, 48, 0.0, "most", "no"),  # a crash is one
+    ],
+)
+def test_a_target_is_open_where_more_campaigns_decide(
+    hits: int, trials: int, target: object, side: str, expected: str
+) -> None:
+    line = scoresheet.share("share", [True] * hits + [False] * (trials - hits), bool, target, side)
+    assert scoresheet.standing(line) == expected
