@@ -82,10 +82,9 @@ def late(seed: int, rest: float, correlation: float = 0.0) -> Record:
     return replace(made, drive=np.where(made.time[:, None] < 2.5, 0.0, made.drive))
 
 
-@pytest.mark.parametrize("rest", [0.1, 0.5])
-def test_movement_before_the_step_is_seen(rest):
-    """By a twentieth of the range of the response, or a quarter in too few samples for the test of rest."""
-    moving = late(4, rest)
+def test_movement_before_the_step_is_seen():
+    """By a twentieth of the range of the response, which the test of rest lets pass."""
+    moving = late(4, 0.1)
     assert not not_at_rest([moving])
     (limit,) = found(problem(moving, noise="white"))
     assert "before step, whose response moves before its drive does: u = 0." in limit.reason
