@@ -29,7 +29,7 @@ _SHARED = 0.5
 """Share of all changes of a drive beyond which none are kept apart [-]."""
 _PLACES = round(1.0 / _SAME_PHASE)
 _TOGETHER = 1 << 17
-"""Numbers of a step response times phases that are read at once; more no longer fit the cache."""
+"""Numbers of a step response times phases or changes that are read at once; more no longer fit the cache."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -162,8 +162,7 @@ class Superposition:
         if not lattice.times.size:
             return out
         if lattice.slots is None:
-            for phase in changes:
-                self._add_anywhere(out, response, phase, lattice, delays, kind)
+            self._add_anywhere(out, response, changes, lattice, delays, kind)
             return out
         begins = np.array([phase.time for phase in changes])
         origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
@@ -174,22 +173,33 @@ class Superposition:
         return out
 
     def _add_anywhere(
-        self, out: Array, response: StepResponse, phase: Phase, lattice: Lattice, delays: Vector, kind: Kind
+        self,
+        out: Array,
+        response: StepResponse,
+        changes: Sequence[Phase],
+        lattice: Lattice,
+        delays: Vector,
+        kind: Kind,
     ) -> None:
-        """Add the response to one phase at sample times of any spacing."""
-        x = (lattice.times - phase.time - delays[:, None]) / lattice.step
-        width = lattice.exposure / lattice.step
-        many = phase.blocks.size > _ADDED
-        source = self._convolved(response, phase) if many else response
-        shifts = [(0, 1.0)] if many else list(zip(phase.blocks, phase.jumps, strict=True))
-        for shift, jump in shifts:
-            reached = x - shift
-            if lattice.exposure == 0.0:
-                reading = source.at(reached, kind)
+        """Add the response to the changes at sample times of any spacing."""
+        times, jumps = [], []
+        for phase in changes:
+            if phase.blocks.size > _ADDED:
+                onset = phase.time + delays[:, None]
+                out += _read_anywhere(self._convolved(response, phase), lattice, onset, kind)
             else:
-                before: Kind = "value" if kind == "slope" else "integral"
-                reading = (source.at(reached, before) - source.at(reached - width, before)) / width
-            out += jump * reading
+                times.append(phase.time + lattice.step * phase.blocks)
+                jumps.append(phase.jumps)
+        if not times:
+            return
+        every, jump = np.concatenate(times), np.concatenate(jumps)
+        rows, batch, samples = out.shape
+        together = max(1, _TOGETHER // out.size)
+        for first in range(0, every.size, together):
+            some = slice(first, first + together)
+            onsets = every[some] + delays[:, None]
+            reading = _read_anywhere(response, lattice, onsets, kind)
+            out += np.matmul(jump[some], reading.reshape(rows, batch, -1, samples))
 
     def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
         """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
@@ -236,6 +246,17 @@ class Superposition:
             for k, reading in zip(some, readings.swapaxes(0, 1), strict=True):
                 self.kept[places[k]] = _Read.of(origins[k], reading)
         return [self.kept[place] for place in places]
+
+
+def _read_anywhere(response: StepResponse, lattice: Lattice, onsets: Matrix, kind: Kind) -> Array:
+    """Readings of a step response after each onset, (batch, changes) [time unit], at sample times of any
+    spacing, (rows, batch, changes * samples)."""
+    x = ((lattice.times - onsets[..., None]) / lattice.step).reshape(len(onsets), -1)
+    if lattice.exposure == 0.0:
+        return response.at(x, kind)
+    width = lattice.exposure / lattice.step
+    before: Kind = "value" if kind == "slope" else "integral"
+    return (response.at(x, before) - response.at(x - width, before)) / width
 
 
 def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: Kind) -> Array:
