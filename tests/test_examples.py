@@ -9,6 +9,8 @@ from matplotlib.figure import Figure
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
+LONG = ("identifiability-audit", "model-comparison", "next-experiment")
+"""Those that the short form leaves out."""
 
 
 def run(cells: list[str]) -> list[object]:
@@ -24,7 +26,10 @@ def run(cells: list[str]) -> list[object]:
     return shown
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in LONG)) for path in NOTEBOOKS],
+)
 def test_a_notebook_runs(path, monkeypatch):
     monkeypatch.chdir(EXAMPLES)
     cells = json.loads(path.read_text("utf-8"))["cells"]

@@ -382,6 +382,7 @@ def test_both_engines_give_a_replica_the_same_posterior():
     assert same_quantiles(found["importance"], found["sampling"])
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_good_lead_to_the_ensembles(alone, monkeypatch):
     assert results(alone)["engine"]["importance"] == 3
     monkeypatch.setattr("lcopa_bayes.sampling.importance.LEAST_EFFICIENCY", 9.0)
@@ -555,6 +556,7 @@ def address() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_numbers(alone, address, tmp_path):
     same(alone, calibrate(STUDY, replicas=3, dask=address, folder=tmp_path))
     assert len(list((tmp_path / "replicas").iterdir())) == 3

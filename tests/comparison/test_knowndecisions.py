@@ -162,6 +162,7 @@ def verdict(order: float, sd: float, rng) -> str:
     return str(outcome(*rows)["fractional"]["verdict"])
 
 
+@pytest.mark.slow
 def test_fractional_orders_are_not_warranted_by_chance():
     """A Bayes factor of 20 against the truth has a probability of 1/20 at most; with prediction far less."""
     found = [verdict(1.0, 0.05, np.random.default_rng(seed)) for seed in range(DRAWS)]

@@ -265,6 +265,7 @@ def test_pareto_k_of_another_width_is_that_of_new_over_old_density(pair, monkeyp
 FEW = {"ensembles": 2, "walkers": 16, "steps": 400, "thin": 2, "target_ess": 100}
 
 
+@pytest.mark.slow
 def test_candidates_that_share_levels_differently_are_compared():
     """Scores have one length whatever a candidate takes its level from; each says from where."""
     reported_priors = FIXED | GAIN

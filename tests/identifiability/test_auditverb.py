@@ -85,6 +85,7 @@ def test_the_page_stands_alone_and_shows_every_verdict(run):
     }
 
 
+@pytest.mark.slow
 def test_resumed_and_in_two_processes_it_says_the_same(study, run, capsys):
     before = (run / "audit.json").read_bytes()
     words = ["audit", study, "--quick", "--resume", "--jobs", 2, "--out", run, "--json"]

@@ -407,6 +407,7 @@ def test_fixed_orders_are_kept_and_equal_ones_merged():
     assert_allclose(found.output_error.model.etas, ETAS, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_unless_asked(capsys):
     once, plan = study(clean(0.2), terms=2), replace(NARROW, rounds=0, delay=Interval(1, 1))
     identify(once, plan=plan)

@@ -128,11 +128,13 @@ def test_a_number_that_moves_limits_its_parameter_alone() -> None:
     assert all(one.level == "tentative" for one in limitations)
 
 
+@pytest.mark.slow
 def test_without_gaussian_noise_or_a_moving_drive_there_is_none() -> None:
     students = study(record(), noise="student", sampler=QUICK)
     assert alternatives_of(sampled(students)) == ()
 
 
+@pytest.mark.slow
 def test_a_fit_whose_structure_the_records_chose_shows_them(tmp_path: Path) -> None:
     fitted = fit(study(record(), terms="auto", sampler=QUICK), folder=tmp_path)
     values = json.loads((tmp_path / "results.json").read_text())["alternatives"]

@@ -144,7 +144,7 @@ def on_grid(name: str, points: int) -> tuple[Vector, Matrix]:
     return axis, found.reshape(*[points] * grid.shape[1])
 
 
-@pytest.mark.parametrize(("name", "points"), [("one", 200), ("two", 40)])
+@pytest.mark.parametrize(("name", "points"), [("one", 200), pytest.param("two", 40, marks=pytest.mark.slow)])
 def test_fractional_calculus_with_integer_orders_is_the_integer_model(name, points):
     """Likelihood point by point, then the marginals of a run against quadrature."""
     posterior, _ = integer(name)
@@ -194,6 +194,7 @@ def test_noise_without_correlation_is_white(rng):
     np.testing.assert_allclose(gaps[0] / gaps[1], 10.0, rtol=0.02)  # first order in the correlation
 
 
+@pytest.mark.slow
 def test_a_run_without_correlation_is_a_run_with_white_noise():
     seen, known = record(camera=0.6), {"order_1": TRUTH["order_1"], "delay": TRUTH["delay"]}
     found: list[Draws] = []

@@ -149,6 +149,7 @@ def test_the_response_of_a_wall_is_that_of_its_series_and_lags() -> None:
     assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_kinds_and_numbers_of_lags_have_equal_parts_in_a_mixture() -> None:
     searches = slab(0)[:2]
     both = LagMixture.of(searches, 3)
@@ -181,6 +182,7 @@ def chains(seed: int) -> Study:
     return Study("chains", None, "s", 0, tuple(records), (), noise={"kind": "white"})
 
 
+@pytest.mark.slow
 def test_walkers_of_several_paths_leave_where_they_began() -> None:
     """Moves of all ten coordinates at once leave hardly more than one effective draw a walker, which is the
     one that it began with."""

@@ -163,6 +163,7 @@ def test_flipped_bits_are_noticed_or_harmless(tmp_path, uninterrupted):
     assert noticed > 20
 
 
+@pytest.mark.slow
 def test_steps_are_rounded_up_to_whole_rounds_and_at_least_two():
     assert sample(POSTERIOR, plan(steps=1)).ensembles[0].steps == 2 * ROUND
     assert sample(POSTERIOR, plan(steps=2 * ROUND + 1, thin=1)).ensembles[0].steps == 3 * ROUND
@@ -195,7 +196,7 @@ def ensemble_at(posterior, position: np.ndarray, seed: np.random.SeedSequence) -
     return Ensemble(*nothing, position, log_density, np.zeros(walkers), 0, state, position, 0)
 
 
-@pytest.mark.parametrize("following", [False, True])
+@pytest.mark.parametrize("following", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ensembles_sample_a_known_normal_density(following):
     """Without and with a mixture to follow, learned from where the walkers start, which is too wide."""
     scales = np.diag([1.0, 0.01, 30.0])
@@ -235,15 +236,16 @@ PRIORS = {
     "two axes": {"share": "all"},
 }
 
-
+SHORT = (("one term", False), ("two axes", False), ("two terms", True))
 FOLLOWING = [
-    pytest.param(name, True, marks=() if name in ("two terms", "two axes") else pytest.mark.slow)
+    pytest.param(name, following, marks=() if (name, following) in SHORT else pytest.mark.slow)
     for name in PRIORS
+    for following in (False, True)
 ]
 
 
 @pytest.mark.parametrize("draws", [60, pytest.param(1500, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("name", "following"), [*((name, False) for name in PRIORS), *FOLLOWING])
+@pytest.mark.parametrize(("name", "following"), FOLLOWING)
 def test_without_information_every_move_leaves_the_prior(name, following, draws):
     """Noise a million times the record: every parameter keeps its prior, or a proposal's volume is wrong.
 

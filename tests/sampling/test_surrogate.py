@@ -74,6 +74,7 @@ def test_near_the_optimum_it_has_the_density_of_the_posterior(stiff: tuple[Poste
     assert np.std(apart) < 0.3
 
 
+@pytest.mark.slow
 def test_weights_make_up_for_a_surrogate_that_is_wrong(stiff: tuple[Posterior, Optimum], monkeypatch):
     """Evidence and stiffness by weighted draws of a surrogate, and by those of the posterior itself."""
     posterior, _ = stiff

@@ -38,6 +38,7 @@ def sampled(posterior: Posterior, own: Run) -> tuple[Matrix, float]:
     return draws.flat[:, posterior.sampled], draws.ess
 
 
+@pytest.mark.slow
 def test_they_agree_with_importance_draws_of_the_whole_prior(monkeypatch):
     """Means to four of their errors, spreads to a tenth: two methods that share the density alone."""
     plan = SamplePlan.of(POSTERIOR.dimension, seed=3, target_ess=1000, method="auto")

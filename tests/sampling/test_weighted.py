@@ -109,6 +109,7 @@ def weighted_run(tmp_path_factory) -> tuple[Run, object]:
     return run, (made.posterior, plan, path)
 
 
+@pytest.mark.slow
 def test_a_study_is_sampled_by_importance_draws_that_agree_with_its_ensembles(weighted_run):
     run, (posterior, plan, _) = weighted_run
     assert run.weighted is not None

@@ -477,6 +477,7 @@ def test_memory_is_that_of_the_process_and_not_of_the_one_that_started_it():
     assert held.nbytes / 1e6 > float(done.stdout) > 50.0
 
 
+@pytest.mark.slow
 def test_a_growth_record_of_means_states_its_loss(monkeypatch):
     monkeypatch.setattr(growth, "WHOLE", 500)
     row = growth.fitted(1000, quick=True)

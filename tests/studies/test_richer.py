@@ -84,6 +84,7 @@ def test_its_part_is_the_stated_weight(found: Loop) -> None:
     assert np.median(own) == pytest.approx(np.median(gain), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_stated_structure_has_none() -> None:
     made = study()
     made = replace(made, model=replace(made.model, terms=2))

@@ -131,6 +131,7 @@ def test_an_output_folder_that_is_a_file(record, tmp_path, capsys):
     assert (tmp_path / "taken").read_text() == "here first"
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_draws(record, tmp_path):
     """Killed without warning as soon as a first round is stored, then resumed."""
     script = "import sys; from lcopa_bayes.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -67,7 +67,7 @@ def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys, mo
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.parametrize("stamped", [False, True])
+@pytest.mark.parametrize("stamped", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_long_table_takes_little_memory_per_row(tmp_path, stamped):
     """A row of three numbers is 24 bytes; as objects of Python it took a thousand."""
 

@@ -27,6 +27,8 @@ SEARCHED = {
     "no sample at rest": Shape(samples=30, early=True, records=3, jitter=0.5, settings=PLAIN),
     "microseconds": Shape(samples=30, unit="s", second=2e-6, records=3, drift=0.1, settings=PLAIN),
 }
+SHORT = ("one record, hours, eight bits", "2x1, missing cells", "no sample at rest")
+"""Of them those that the short form searches."""
 PAIR = ("--pick", "first-order", "fractional-1")
 
 
@@ -79,7 +81,9 @@ def answers(
     }
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("3x2")) for name in SHAPES]
+)
 def test_a_look_at_any_shape(name, tmp_path):
     study = SHAPES[name].study()
     understood, seen = lb.check(study), lb.look(study)
@@ -106,7 +110,7 @@ def test_every_verb_answers(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "2x2")) for name in SEARCHED]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in SHORT)) for name in SEARCHED]
 )
 def test_a_loop_on_any_shape(name, tmp_path, capsys):
     folder = written(SEARCHED[name].study(), tmp_path)
