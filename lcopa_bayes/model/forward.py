@@ -200,13 +200,33 @@ class ForwardModel:
     def _step_response(
         self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: Slopes = None
     ) -> StepResponse:
-        """Step response of an element, from `known` or added to it."""
+        """Step response of an element, from `known` or added to it. Of a single plant all elements of as many
+        terms are evaluated at once, which takes hardly longer than one."""
         circle = self.circles[step]
-        response = known.get((element, step))
-        if response is None or response.coarse.shape[2] < circle.n:
-            times, orders = dynamics.times[element], dynamics.orders[element]
-            response = known[element, step] = step_response(times, orders, circle, step, slopes=slopes)
-        return response.first(circle.n)
+
+        def absent(one: int) -> bool:
+            return (one, step) not in known or known[one, step].coarse.shape[2] < circle.n
+
+        if absent(element):
+            single, terms = dynamics.batch == 1, self.layout.elements[element].terms
+            alike = [one for one in self._acting[step] if self.layout.elements[one].terms == terms]
+            some = list(filter(absent, alike)) if single else [element]
+            times, orders = (
+                np.concatenate([of[one] for one in some]) for of in (dynamics.times, dynamics.orders)
+            )
+            found = step_response(times, orders, circle, step, slopes=slopes)
+            for place, one in enumerate(some):
+                known[one, step] = found.part(slice(place, place + 1)) if single else found
+        return known[element, step].first(circle.n)
+
+    @cached_property
+    def _acting(self) -> dict[float, list[int]]:
+        """Elements that some record of each block width moves."""
+        moved: dict[float, set[int]] = {}
+        for experiment in self.experiments:
+            own = {unit.element for unit in self.layout.units if experiment.phases[unit.drive]}
+            moved.setdefault(experiment.mesh.lattice.step, set()).update(own)
+        return {step: sorted(own) for step, own in moved.items()}
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:

@@ -287,6 +287,11 @@ class StepResponse:
         """The same without derivatives."""
         return replace(self, coarse=self.coarse[:1], fine=self.fine[:1], leading=None)
 
+    def part(self, elements: slice) -> StepResponse:
+        """Those of some elements of the batch."""
+        own = self.coarse[:, elements], self.fine[:, :, elements], self.orders[elements]
+        return StepResponse(*own, self.leading)
+
     def first(self, n: int) -> StepResponse:
         """The first `n` blocks."""
         if n == self.coarse.shape[2]:
