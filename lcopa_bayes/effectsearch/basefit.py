@@ -66,8 +66,10 @@ class BaseFit:
     @property
     def stands_out(self) -> bool:
         """Whether more than noise is left: the plant lacks something, or the search ended beside."""
-        if not (self.noise_known and self.optimum.converged):
-            return self.smooth or not self.optimum.converged
+        if not self.optimum.converged:
+            return True
+        if not self.noise_known:
+            return self.smooth
         return 2.0 * self.optimum.cost > _OUT * self.optimum.residual.size
 
     @property

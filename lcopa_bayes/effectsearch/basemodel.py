@@ -159,9 +159,8 @@ def fitted_base(
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
-    based = partial(
-        _based, again=not alone, crew=crew
-    )  # else richer plants are searched for from more starts
+    # a structure that is chosen has richer plants, which are searched for from more starts anyway
+    based = partial(_based, again=not alone, crew=crew)
     base = based(study)
     separate = _apart(study, base, crew) if alone else (base, study)
     # paths that share too much look like a plant that did not rest

@@ -208,15 +208,15 @@ class ForwardModel:
             return (one, step) not in known or known[one, step].coarse.shape[2] < circle.n
 
         if absent(element):
-            single, terms = dynamics.batch == 1, self.layout.elements[element].terms
+            batch, terms = dynamics.batch, self.layout.elements[element].terms
             alike = [one for one in self._acting[step] if self.layout.elements[one].terms == terms]
-            some = list(filter(absent, alike)) if single else [element]
+            some = list(filter(absent, alike)) if batch == 1 else [element]
             times, orders = (
                 np.concatenate([of[one] for one in some]) for of in (dynamics.times, dynamics.orders)
             )
             found = step_response(times, orders, circle, step, slopes=slopes)
             for place, one in enumerate(some):
-                known[one, step] = found.part(slice(place, place + 1)) if single else found
+                known[one, step] = found.part(slice(place * batch, (place + 1) * batch))
         return known[element, step].first(circle.n)
 
     @cached_property

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -25,7 +24,7 @@ from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.results.averages import parts_of_sd, pooled
 from lcopa_bayes.results.fit import Fit
-from lcopa_bayes.results.integerfit import IntegerFit, integer_fit
+from lcopa_bayes.results.integerfit import IntegerFit
 from lcopa_bayes.results.steps import Metric, metrics_of
 from lcopa_bayes.results.sumsoflags import (
     Alternative,
@@ -177,18 +176,9 @@ def _plant(fitted: Fit) -> FittedPlant | None:
     return FittedPlant(fitted.problem, best, noise, fitted.curves, fitted.run.plan.seed)
 
 
-def with_alternatives(
-    fitted: Fit,
-    *,
-    jobs: int = 1,
-    folder: Path | None = None,
-    resume: bool = False,
-    quick: bool = False,
-    quiet: bool = True,
-) -> Fit:
-    """A fit with the figures of its step responses over all plants, and what follows for its grade; the
-    parameters are those of `fit`."""
-    integer = integer_fit(fitted, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
+def with_alternatives(fitted: Fit, integer: IntegerFit | None) -> Fit:
+    """A fit with the figures of its step responses over all plants, that with `integer` orders among them,
+    and what follows for its grade."""
     own = _plant(fitted)
     found = lags_beside(own) if own else ()
     if not found and integer is None:

@@ -191,7 +191,8 @@ class _Begun:
         powers = [one @ inverse @ one for one, inverse in zip(levels, inverses, strict=True)]
         squares = before**2 - after**2
         for k, rows in enumerate(self._at_rest):
-            powers[k] = min(powers[k], squares[rows].sum()) if rows.size else powers[k]
+            if rows.size:
+                powers[k] = min(powers[k], squares[rows].sum())
         return [float(chi2.sf(power, drives)) for power in powers]
 
     @property

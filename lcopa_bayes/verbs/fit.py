@@ -12,6 +12,7 @@ from lcopa_bayes.results.alternatives import with_alternatives
 from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
+from lcopa_bayes.results.integerfit import integer_fit
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.result import write_page
@@ -73,9 +74,8 @@ def fit(
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
         if structure:
             fitted = replace(fitted, structure=structure)
-            fitted = with_alternatives(
-                fitted, jobs=jobs, folder=place, resume=resume, quick=quick, quiet=quiet
-            )
+            integer = integer_fit(fitted, jobs=jobs, folder=place, resume=resume, quick=quick, quiet=quiet)
+            fitted = with_alternatives(fitted, integer)
         if place is not None:
             fitted.save(place, compact=compact, jobs=jobs, page=page)
     return fitted

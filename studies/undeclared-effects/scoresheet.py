@@ -71,24 +71,18 @@ def share(
     low, high = bounds(hits, trials)
     value = hits / trials
     line = {"measure": name, "target": target, "side": side, "value": value, "lower": low, "upper": high}
-    return line | {"trials": trials, "reached": _reached(value, target, side)}
-
-
-def _reached(value: float, target: Any, side: str) -> bool:
-    if side == "within":
-        return bool(target[0] <= value <= target[1])
-    return bool(value <= target if side == "most" else value >= target)
+    return line | {"trials": trials}
 
 
 def standing(line: Row) -> str:
     """Whether a line reaches its target: "yes", "no", or "open" where its value does not but its 95 %
     interval does, so that more campaigns decide."""
-    if line["reached"] or "lower" not in line:
-        return "yes" if line["reached"] else "no"
-    least, most = {"within": line["target"], "least": (line["target"], 1.0), "most": (0.0, line["target"])}[
-        line["side"]
-    ]
-    return "open" if line["lower"] <= most and line["upper"] >= least else "no"
+    target, value = line["target"], line["value"]
+    ends = {"within": target, "least": (target, np.inf), "most": (-np.inf, target)}
+    least, most = ends[line["side"]]
+    if least <= value <= most:
+        return "yes"
+    return "open" if line.get("lower", value) <= most and line.get("upper", value) >= least else "no"
 
 
 def number(
@@ -105,7 +99,6 @@ def number(
         "side": side,
         "value": value,
         "trials": len(finite),
-        "reached": _reached(value, target, side),
         "quartiles": [float(q) for q in np.quantile(finite, [0.25, 0.75])],
     }
 

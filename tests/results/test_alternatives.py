@@ -16,6 +16,7 @@ from lcopa_bayes.results.alternatives import Alternatives, alternatives_of, with
 from lcopa_bayes.results.averages import parts_of_sd
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
+from lcopa_bayes.results.integerfit import integer_fit
 from lcopa_bayes.verbs.fit import fit
 
 QUICK = {"ensembles": 2, "walkers": 16, "steps": 200, "thin": 1, "target_ess": 50}
@@ -35,7 +36,7 @@ def short() -> Fit:
 
 @pytest.fixture(scope="module")
 def over(short: Fit) -> Alternatives:
-    other = with_alternatives(short).alternatives
+    other = with_alternatives(short, integer_fit(short)).alternatives
     assert other is not None
     return other
 
@@ -82,7 +83,7 @@ def test_the_advantage_is_akaikes_criterion_of_two_least_squares(short: Fit, ove
 
 
 def test_a_better_sum_of_lags_limits_every_number(short: Fit) -> None:
-    fitted = with_alternatives(short)
+    fitted = with_alternatives(short, integer_fit(short))
     assert fitted.draws.grade.level == "tentative"
     assert "sums of 2 to 3 lags follow y better" in fitted.draws.grade.reason
     reported = {one.name: one for one in fitted.metrics}["delay[y]"]
@@ -100,7 +101,7 @@ def own() -> Fit:
 
 
 def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None:
-    fitted = with_alternatives(own)
+    fitted = with_alternatives(own, integer_fit(own))
     other = fitted.alternatives
     assert other is not None
     (one,) = other.alternatives
@@ -119,7 +120,8 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
 
 
 def test_a_number_that_moves_limits_its_parameter_alone() -> None:
-    other = with_alternatives(one_term(made(sd=4 * SD))).alternatives
+    noisy = one_term(made(sd=4 * SD))
+    other = with_alternatives(noisy, integer_fit(noisy)).alternatives
     assert other is not None
     assert other.alternatives[0].support == "both"
     limitations = other.limitations({"delay[y]": ("delay",), "steady_state[y]": ("gain",)})

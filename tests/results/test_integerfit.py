@@ -49,7 +49,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def over(folder: Path) -> Fit:
-    return with_alternatives(fitted(LAG, 1), folder=folder, quick=True)
+    own = fitted(LAG, 1)
+    return with_alternatives(own, integer_fit(own, folder=folder, quick=True))
 
 
 def agree(integer: IntegerFit, path: TransferPath, orders: Orders, terms: int) -> None:
@@ -86,7 +87,8 @@ def test_numbers_are_over_plants_with_free_and_integer_orders(over: Fit) -> None
 @pytest.mark.slow
 def test_integer_orders_hold_what_free_ones_put_at_an_end() -> None:
     """Orders below 2 come with a longer delay: most draws of the fitted plant are beyond the true one."""
-    ringing = with_alternatives(fitted(RINGING, 2))
+    own = fitted(RINGING, 2)
+    ringing = with_alternatives(own, integer_fit(own))
     agree(parts(ringing)[1], RINGING, {"": (2.0, 1.0)}, 2)
     beyond = {kind: float(np.mean(own > RINGING.delay)) for kind, own in delay_of(ringing).parts.items()}
     assert beyond["plant"] > beyond["integer"] + 0.1
