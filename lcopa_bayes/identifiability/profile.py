@@ -183,6 +183,7 @@ class _Path:
         self.beyond = _BEYOND * self.freedom.fall_at(max(LEVELS))
         at = min(max(landscape.coordinate(k, peak.values[k]), self.low), self.high)
         self.points: dict[float, Peak] = {at: peak}
+        self.begun: dict[float, list[Peak]] = {}
         self.start = at
         self.witnesses = witnesses
         self.where = landscape.column(k, witnesses) if witnesses.size else np.empty(0)
@@ -197,7 +198,8 @@ class _Path:
         if self.landscape.precision is None:  # else of one mode, and from the posterior itself at the end
             for at in (sorted(self.points), sorted(self.points, reverse=True)):
                 for near, far in pairwise(at):  # from either end through to the other
-                    self.improve(far, self.points[near].values)
+                    if not any(self.points[near] is start for start in self.begun.get(far, ())):
+                        self.improve(far, self.points[near].values)
             self.from_draws()
             self.extend_ends()
             self.refine()
@@ -241,6 +243,7 @@ class _Path:
             if side * (end - ahead) < 0.2 * step:
                 ahead = end
             solved = self.solve(ahead, self._ahead(here, u, before, ahead))
+            self.begun[ahead] = [here]
             moved = abs(np.sqrt(self.fall(solved)) - np.sqrt(self.fall(here)))
             if moved > 3 * _STRIDE and abs(ahead - u) > 1e-7 * width:
                 step = 0.4 * abs(ahead - u)
@@ -262,7 +265,8 @@ class _Path:
                 far = b - a > _GAP * (self.high - self.low) and max(falls) < self.beyond
                 if (steep or far) and b - a > 1e-6 * (self.high - self.low):
                     middle = 0.5 * (a + b)
-                    tried = [self.solve(middle, self.points[u].values) for u in (a, b)]
+                    self.begun[middle] = [self.points[u] for u in (a, b)]
+                    tried = [self.solve(middle, start.values) for start in self.begun[middle]]
                     self.points[middle] = max(tried, key=lambda peak: peak.log_likelihood)
 
     def _ahead(self, here: Peak, u: float, before: tuple[float, Peak] | None, ahead: float) -> Vector:

@@ -12,6 +12,7 @@ layer, which begins with the square root of time, by a shorter one.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -24,6 +25,8 @@ Kind = Literal["lags", "wall", "layer"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 _MODES = 60
 """Lags of a series; what the others add is in the last [-]."""
+_TABULATED = 8192
+"""Places between which the response of a series is linear in the root of time [-]."""
 
 
 def series(kind: Kind) -> tuple[Vector, Vector]:
@@ -39,9 +42,19 @@ def series(kind: Kind) -> tuple[Vector, Vector]:
 
 def rises(kind: Kind, since: Array, time: Array) -> Array:
     """Share of the steady response `since` the delay after a step, with the slowest time constant `time`, in
-    the shape of both together."""
+    the shape of both together; of diffusion to 1e-5."""
+    if kind == "lags":
+        return np.asarray(-np.expm1(-since / time))
+    return np.interp(np.sqrt(since / time), *_tabulated(kind))
+
+
+@cache
+def _tabulated(kind: Kind) -> tuple[Vector, Vector]:
+    """Roots of times over the slowest time constant, and the share of the steady response there: a layer
+    begins with the root of time. After the last of them exp(-36) is left."""
+    root = np.linspace(0.0, 6.0, _TABULATED)
     pairs = zip(*series(kind), strict=True)
-    return np.asarray(sum(-weight * np.expm1(-since / (ratio * time)) for ratio, weight in pairs))
+    return root, np.sum([-weight * np.expm1(-(root**2) / ratio) for ratio, weight in pairs], axis=0)
 
 
 def diffused(table: LagTable, kind: Kind) -> LagTable:

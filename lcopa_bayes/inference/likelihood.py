@@ -92,8 +92,16 @@ class Landscape:
         return self.posterior.table.rows[k].coordinate(values[:, k])
 
     def search(self, k: int) -> tuple[float, float]:
-        """Ends of the search of one parameter in its coordinate: its domain, or for a prior without ends of
-        its own 100 standard deviations, on logarithmic scales the decades with all but 2e-9 of its mass."""
+        """Ends of the search of one free parameter in its coordinate: its domain, or for a prior without ends
+        of its own 100 standard deviations, on logarithmic scales the decades with all but 2e-9 of its mass.
+        """
+        return self._searches[k]
+
+    @cached_property
+    def _searches(self) -> dict[int, tuple[float, float]]:
+        return {k: self._search(k) for k in self.free}
+
+    def _search(self, k: int) -> tuple[float, float]:
         row = self.posterior.table.rows[k]
         assert row.prior is not None
         low, high = row.domain
@@ -123,7 +131,7 @@ class Landscape:
             return self._jointly(start, held)
         noise_moves = any(k not in self.least.columns and k != held for k in self.free)
         values, best = start, -np.inf
-        for _ in range(_ROUNDS if noise_moves else 1):
+        for _ in range(_ROUNDS if noise_moves and not self._one_scale else 1):
             both = [self._plant(values, held, most)]
             if noise_moves:
                 both.append(self._noise(both[0], held))
@@ -132,6 +140,11 @@ class Landscape:
             if gained < _GAINED:
                 break
         return Peak(values, best)
+
+    @cached_property
+    def _one_scale(self) -> bool:
+        """Whether noise is a scale of one response alone, which leaves the plant's maximum where it is."""
+        return self.posterior.noise.names == ("sigma",) and len(self.posterior.table.layout.responses) == 1
 
     def exact(self, values: Matrix) -> Vector:
         """`log_likelihood` of the posterior itself where a surrogate stands for it, (batch,) [nat]."""

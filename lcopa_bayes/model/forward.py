@@ -200,33 +200,43 @@ class ForwardModel:
     def _step_response(
         self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: Slopes = None
     ) -> StepResponse:
-        """Step response of an element, from `known` or added to it. Of a single plant all elements of as many
-        terms are evaluated at once, which takes hardly longer than one."""
+        """Step response of an element on one block width, from `known` or added to it. Of a single plant all
+        that need about as many blocks are evaluated at once, which takes hardly longer than one."""
         circle = self.circles[step]
 
-        def absent(one: int) -> bool:
-            return (one, step) not in known or known[one, step].coarse.shape[2] < circle.n
+        def absent(one: tuple[int, float]) -> bool:
+            return one not in known or known[one].coarse.shape[2] < self.circles[one[1]].n
 
-        if absent(element):
-            batch, terms = dynamics.batch, self.layout.elements[element].terms
-            alike = [one for one in self._acting[step] if self.layout.elements[one].terms == terms]
-            some = list(filter(absent, alike)) if batch == 1 else [element]
+        if absent((element, step)):
+            batch = dynamics.batch
+            some = [*filter(absent, self._evaluated[element, step])] if batch == 1 else [(element, step)]
             times, orders = (
-                np.concatenate([of[one] for one in some]) for of in (dynamics.times, dynamics.orders)
+                np.concatenate(parts)
+                for parts in (
+                    [dynamics.times[one] / width for one, width in some],
+                    [dynamics.orders[one] for one, _ in some],
+                )
             )
-            found = step_response(times, orders, circle, step, slopes=slopes)
+            longest = max((self.circles[width] for _, width in some), key=lambda circle: circle.n)
+            found = step_response(times, orders, longest, 1.0, slopes=slopes)
             for place, one in enumerate(some):
-                known[one, step] = found.part(slice(place * batch, (place + 1) * batch))
+                known[one] = found.part(slice(place * batch, (place + 1) * batch))
         return known[element, step].first(circle.n)
 
     @cached_property
-    def _acting(self) -> dict[float, list[int]]:
-        """Elements that some record of each block width moves."""
-        moved: dict[float, set[int]] = {}
-        for experiment in self.experiments:
-            own = {unit.element for unit in self.layout.units if experiment.phases[unit.drive]}
-            moved.setdefault(experiment.mesh.lattice.step, set()).update(own)
-        return {step: sorted(own) for step, own in moved.items()}
+    def _evaluated(self) -> dict[tuple[int, float], list[tuple[int, float]]]:
+        """For each element and block width of records, those of as many terms and about as many blocks."""
+        used = {
+            (unit.element, experiment.mesh.lattice.step)
+            for experiment in self.experiments
+            for unit in self.layout.units
+            if experiment.phases[unit.drive]
+        }
+        groups: dict[tuple[int, int], list[tuple[int, float]]] = {}
+        for element, step in sorted(used):
+            size = self.circles[step].n.bit_length()
+            groups.setdefault((self.layout.elements[element].terms, size), []).append((element, step))
+        return {one: group for group in groups.values() for one in group}
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:

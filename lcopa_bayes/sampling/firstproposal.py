@@ -14,9 +14,10 @@ from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima, nearly_white
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.importanceweights import tempered
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Optima, Outer, PriorOrders
-from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, tempered, weighty
+from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, weighty
 
 Done = Callable[[Optima, Matrix, Matrix | None], list[Matrix]]
 

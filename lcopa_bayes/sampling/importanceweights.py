@@ -1,4 +1,4 @@
-"""Importance weights smoothed by a generalised Pareto tail, and diagnostics of their reliability.
+"""Importance weights smoothed by a generalised Pareto tail or tempered, and diagnostics of their reliability.
 
 Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25. The only place that calls the library: its function
 takes the logarithm of the *inverse* weights, as of likelihoods that are to be taken away.
@@ -53,3 +53,13 @@ def _bounded(log_weights: Vector) -> bool:
     """Whether the largest weights are many and equal, as of a density with a plateau."""
     largest = np.sort(log_weights)[-max(5, log_weights.size // 50) :]
     return bool(largest[-1] - largest[0] <= _EQUAL)
+
+
+def tempered(log_weights: Vector, wanted: float) -> Vector:
+    """Normalised weights to the largest power up to 1 that leaves as many effective draws as are wanted; half
+    of the draws with any weight where that is less."""
+    wanted = min(wanted, 0.5 * np.count_nonzero(np.isfinite(log_weights)))
+    power = 1.0
+    while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
+        power *= 0.9
+    return np.asarray(np.exp(power * log_weights - logsumexp(power * log_weights)))

@@ -34,7 +34,7 @@ from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.aroundoptima import around_optima
 from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
-from lcopa_bayes.sampling.importanceweights import effective, usable_k
+from lcopa_bayes.sampling.importanceweights import effective, tempered, usable_k
 from lcopa_bayes.sampling.mixture import spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.outer import Draw, Optima, Outer, Walk
@@ -46,7 +46,6 @@ from lcopa_bayes.sampling.proposal import (
     adapted,
     clustered,
     paraboloid,
-    tempered,
 )
 from lcopa_bayes.sampling.weighted import Weighted, resampled
 

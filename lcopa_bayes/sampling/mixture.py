@@ -101,15 +101,17 @@ class Mixture:
         """Log density, (n,)."""
         return np.asarray(logsumexp(self.log_parts(points), axis=0))
 
-    def log_parts(self, points: Matrix) -> Matrix:
-        """Log density of each component times its weight, (components, n)."""
+    def log_parts(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
+        """Log density of each component times its weight, (components, n), from `distances` where given."""
+        if distances is None:
+            distances = self.distances(points)
         dimension = self.dimension
         level = (
             gammaln((FREEDOM + dimension) / 2)
             - gammaln(FREEDOM / 2)
             - 0.5 * dimension * np.log(FREEDOM * np.pi)
         )
-        parts = -0.5 * (FREEDOM + dimension) * np.log1p(self.distances(points) / FREEDOM)
+        parts = -0.5 * (FREEDOM + dimension) * np.log1p(distances / FREEDOM)
         scale = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(axis=1)
         with np.errstate(divide="ignore"):
             return np.asarray(parts + (level - scale + np.log(self.weights))[:, None])
@@ -121,9 +123,10 @@ class Mixture:
             out[k] = ((points @ whitener - self.means[k] @ whitener) ** 2).sum(axis=1)
         return out
 
-    def log_shares(self, points: Matrix) -> Matrix:
-        """Log probability of each component given a point, (components, n)."""
-        parts = self.log_parts(points)
+    def log_shares(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
+        """Log probability of each component given a point, (components, n); `distances` where these are
+        known."""
+        parts = self.log_parts(points, distances)
         return np.asarray(parts - logsumexp(parts, axis=0))
 
     @cached_property

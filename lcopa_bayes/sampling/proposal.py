@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol, final
 
 import numpy as np
@@ -17,7 +18,7 @@ from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.importanceweights import effective
+from lcopa_bayes.sampling.importanceweights import tempered
 from lcopa_bayes.sampling.mixture import FREEDOM, Mixture
 
 _NEGLIGIBLE = 20.0
@@ -42,6 +43,8 @@ _PER_DIMENSION = 40
 """Effective draws that a fit of the proposal needs for each dimension [-]."""
 _STEPS = 4
 """Steps of expectation maximisation per round."""
+_ROUNDED = 1e-12
+"""Standard deviation of points below which they are one, over 1 and their distance from 0 [-]."""
 _NO_WEIGHT = 1e-9
 """Draws with less than this share of the mean weight do not take part in the fit [-]."""
 _NO_MASS = 1e-4
@@ -291,7 +294,8 @@ def _at_heaviest(y: Matrix, log_weights: Vector) -> Mixture:
 
 def paraboloid(y: Matrix, log_density: Vector) -> Mixture | None:
     """A component with the mode and curvature of a quadratic fitted to the highest log densities: it moves
-    and turns towards a single mode where hardly a draw has any weight. None with too few points."""
+    and turns towards a single mode where hardly a draw has any weight. None with too few points, or with such
+    as only rounding distinguishes."""
     size = y.shape[1]
     first, second = np.triu_indices(size)
     wanted = _PER_COEFFICIENT * (1 + size + first.size)
@@ -299,7 +303,9 @@ def paraboloid(y: Matrix, log_density: Vector) -> Mixture | None:
         return None
     near = np.count_nonzero(log_density > log_density.max() - _NEARLY * (1 + size))
     best = np.argsort(-log_density, kind="stable")[: max(wanted, near)]
-    centre, scale = y[best].mean(axis=0), y[best].std(axis=0) + 1e-300
+    centre, scale = y[best].mean(axis=0), y[best].std(axis=0)
+    if (scale <= _ROUNDED * (1.0 + np.abs(centre))).any():
+        return None
     x, level = (y[best] - centre) / scale, log_density[best] - log_density[best[0]]
     terms = np.column_stack([np.ones(best.size), x, x[:, first] * x[:, second]])
     counted = 1.0 / (1.0 - level / size)  # far below the highest a density is not quadratic
@@ -367,30 +373,27 @@ class _Cloud:
 
     def maximised(self, core: Mixture, steps: int) -> Mixture:
         """Student components after steps of expectation maximisation."""
-        y = self.y
+        size = self.y.shape[1]
         for _ in range(steps):
-            shares, distances = np.exp(core.log_shares(y)), core.distances(y)
-            means, factors, masses = [], [], []
-            for share, distance in zip(shares, distances, strict=True):
-                own = self.weights * share
-                mass = own.sum()
-                if mass < _NO_MASS:
-                    continue
-                heavy = own * (FREEDOM + y.shape[1]) / (FREEDOM + distance)
-                mean = heavy @ y / heavy.sum()
-                covariance = ((heavy[:, None] * (y - mean)).T @ (y - mean)) / mass
-                means.append(mean)
-                factors.append(np.linalg.cholesky(covariance + self.floor))
-                masses.append(mass)
-            core = Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))
+            distances = core.distances(self.y)
+            own = np.exp(core.log_shares(self.y, distances)) * self.weights
+            mass = own.sum(axis=1)
+            kept = mass >= _NO_MASS
+            own, mass = own[kept], mass[kept]
+            heavy = own * (FREEDOM + size) / (FREEDOM + distances[kept])
+            moments, total = heavy @ self._moments, heavy.sum(axis=1, keepdims=True)
+            shift = moments[:, :size] / total
+            second = np.empty((len(mass), size, size))
+            first, other = np.triu_indices(size)
+            second[:, first, other] = second[:, other, first] = moments[:, size:]
+            second -= total[..., None] * shift[:, :, None] * shift[:, None]
+            factors = np.linalg.cholesky(second / mass[:, None, None] + self.floor)
+            core = Mixture(mass / mass.sum(), self.centre + shift, factors)
         return core
 
-
-def tempered(log_weights: Vector, wanted: float) -> Vector:
-    """Normalised weights to the largest power up to 1 that leaves as many effective draws as are wanted; half
-    of the draws with any weight where that is less."""
-    wanted = min(wanted, 0.5 * np.count_nonzero(np.isfinite(log_weights)))
-    power = 1.0
-    while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
-        power *= 0.9
-    return np.asarray(np.exp(power * log_weights - logsumexp(power * log_weights)))
+    @cached_property
+    def _moments(self) -> Matrix:
+        """Deviations of the draws from their centre and products of any two, (n, dimension and pairs)."""
+        apart = self.y - self.centre
+        first, other = np.triu_indices(apart.shape[1])
+        return np.concatenate([apart, apart[:, first] * apart[:, other]], axis=1)

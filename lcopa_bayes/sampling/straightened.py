@@ -15,9 +15,8 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.sampling.importanceweights import effective
+from lcopa_bayes.sampling.importanceweights import effective, tempered
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.proposal import tempered
 
 _DEGREE, _LEAST_DEGREE, _FEW = 3, 2, 2
 """Degree of the polynomial, of one in more than so many orders, and that number [-]."""

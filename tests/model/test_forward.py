@@ -329,6 +329,25 @@ def test_paths_of_two_axes_are_single_paths(rng):
         assert_allclose(read[index, 2], alone, rtol=0, atol=1e-9)
 
 
+def test_records_on_blocks_of_any_width_are_as_if_each_stood_alone(rng):
+    """Step responses of a single plant on blocks of several widths are evaluated together."""
+    model, dynamics = two_axes("none", "path", rng)
+    plant, drives = dynamics[1:2], model.experiments[0].drives
+    experiments = tuple(
+        replace(model.experiments[0], mesh=Mesh.of_samples(step * np.arange(count), drives[0].times[0]))
+        for step, count in ((0.1, 60), (0.13, 70), (0.02, 300))
+    )
+    together = ForwardModel(model.layout, experiments)
+    widths = {experiment.mesh.lattice.step for experiment in experiments}
+    assert len(widths) == len(experiments)
+    parts = [ForwardModel(model.layout, (experiment,)) for experiment in experiments]
+    for found, part in zip(together.unit_responses(plant), parts, strict=True):
+        assert_allclose(found, part.unit_responses(plant)[0], rtol=0, atol=1e-9)
+    for (_, slopes), part in zip(together.unit_slopes(plant), parts, strict=True):
+        for own, wanted in zip(slopes, part.unit_slopes(plant)[0][1], strict=True):
+            assert_allclose(own, wanted, rtol=0, atol=1e-9)
+
+
 # Derivatives
 
 

@@ -17,10 +17,11 @@ from lcopa_bayes.inference.conditional import Conditional, Expanded
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.sampling import marginal, outer
 from lcopa_bayes.sampling.conditionaldraws import Kept, kept
+from lcopa_bayes.sampling.importanceweights import tempered
 from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Outer, PriorOrders, applies
-from lcopa_bayes.sampling.proposal import Blend, Product, Seen, adapted, clustered, paraboloid, tempered
+from lcopa_bayes.sampling.proposal import Blend, Product, Seen, adapted, clustered, paraboloid
 from lcopa_bayes.sampling.weighted import error_of
 
 GAIN = {"gain": ("loguniform", {"a": 0.5, "b": 5.0})}
