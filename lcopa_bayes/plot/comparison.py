@@ -13,6 +13,7 @@ from lcopa_bayes.plot.theme import (
     CYCLE,
     NOISE,
     blank,
+    dots,
     draw_band,
     draw_line,
     headed,
@@ -32,7 +33,7 @@ def candidates_figure(
     some = parts[rows[0]["name"]]
     colour, unit = headed(top, record, axis, held_out=held), str(some["unit"].iloc[0])
     seen, time = some["observed"].to_numpy(), some["time"].to_numpy()
-    draw_line(top, time, seen, ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
+    draw_line(top, time, seen, ".", ms=dots(seen.size), mew=0, color=colour, label="observed", zorder=1)
     for row, own in zip(rows, CYCLE * len(rows), strict=False):
         _rival(
             top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == results["preferred"], held

@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcopa_bayes.core.estimate import HALF_WIDTH
-from lcopa_bayes.plot.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain
+from lcopa_bayes.plot.theme import BAND, HELD_OUT, NOISE, SEEN, blank, dots, label, plain
 
 
 def _residual(axes: Axes, curve: Mapping[str, Any], when: str, colour: str, unit: str) -> None:
     time = np.array(curve["time"], dtype=float)
     width = np.array(curve[f"half_width_{when}"], dtype=float)
     axes.fill_between(time, -width, width, color=NOISE, alpha=0.25, lw=0)
-    axes.plot(time, curve[when], ".", ms=1.6, mew=0, color=colour)
+    axes.plot(time, curve[when], ".", ms=dots(time.size), mew=0, color=colour)
     axes.axhline(0.0, color=NOISE, lw=0.6)
     axes.set(title=plain(f"{curve['record']}, {curve['axis']}: {when}"), xlabel=label("time", unit))
 

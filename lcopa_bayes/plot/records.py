@@ -20,6 +20,7 @@ from lcopa_bayes.plot.theme import (
     NOISE,
     SEEN,
     blank,
+    dots,
     draw_bands,
     draw_line,
     extremes,
@@ -52,10 +53,8 @@ def response_figure(run: RunData, record: str, axis: str) -> Figure:
     draw_response(top, rows, BANDS)
     colour = headed(top, record, axis, held_out=held)
     seen = rows["observed"].to_numpy()
-    size = 2.5 if extremes(seen).size > 300 else 3.2
-    draw_line(
-        top, rows["time"].to_numpy(), seen, ".", ms=size, mew=0, color=colour, label="observed", zorder=3
-    )
+    style = {"ms": dots(seen.size), "mew": 0, "color": colour}
+    draw_line(top, rows["time"].to_numpy(), seen, ".", label="observed", zorder=3, **style)
     legend_above(figure, top, 5, markerscale=2)
     return figure
 
@@ -121,7 +120,7 @@ def residual_figure(run: RunData, record: str, axis: str) -> Figure:
     colour = headed(top, record, axis, held_out=held)
     top.axhline(0.0, color=NOISE, lw=0.7)
     time, residual = rows["time"].to_numpy(), rows["residual"].to_numpy()
-    draw_line(top, time, residual, ".-", ms=2, mew=0, lw=0.5, color=colour)
+    draw_line(top, time, residual, ".-", ms=dots(time.size), mew=0, lw=0.5, color=colour)
     top.set(xlabel=label("time", run.time_unit), ylabel=label("residual", rows["unit"].iloc[0]))
     _lags(panels["lags"], run.part("autocorrelation", record, axis))
     _spectrum(panels["spectrum"], run.part("spectrum", record, axis), run.time_unit)
@@ -223,4 +222,6 @@ def _bands(panel: Axes, rows: pd.DataFrame) -> None:
             draw_line(panel, time, edge, color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
     if rows["observed"].notna().any():
         seen = rows["observed"].to_numpy()
-        draw_line(panel, time, seen, ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
+        draw_line(
+            panel, time, seen, ".", ms=dots(seen.size), mew=0, color=HELD_OUT, label="observed", zorder=3
+        )

@@ -113,6 +113,11 @@ def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[A
     return figure, list(panels[:count])
 
 
+def dots(count: int) -> float:
+    """Diameter of the dots of so many samples [pt]: few are seen, many do not cover what they stand on."""
+    return min(max(5.4 - 1.1 * log10(max(count, 1)), 1.6), 4.0)
+
+
 def _log_ticks(axis: Axis) -> None:
     """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
     low, high = axis.get_view_interval()
