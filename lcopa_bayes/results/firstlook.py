@@ -30,7 +30,7 @@ from lcopa_bayes.results.discretisation import optima_of
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.residuals import WHITE_P, Residual, residuals
 from lcopa_bayes.results.restbefore import rest_before
-from lcopa_bayes.results.summary import fixed_values, scores
+from lcopa_bayes.results.summary import fixed_values, overview_of_look, scores
 from lcopa_bayes.results.tables import data_tables
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
@@ -95,6 +95,17 @@ class FirstLook:
         )
 
     @property
+    def whiteness(self) -> str:
+        """Whether the noise model explains what the optimum leaves; empty where that is not tested."""
+        tested = [one.p_white for one in self.residuals if not one.held_out]
+        if not tested:
+            return ""
+        white = min(tested) * len(tested) >= WHITE_P
+        said = "The residual is compatible with the noise model"
+        said = said if white else "The noise model does not explain the residual"
+        return f"{said} (smallest p = {min(tested):.2g})"
+
+    @property
     def verdict(self) -> str:
         """How well the best optimum follows the records, and what the numbers rest on."""
         study = self.problem.study
@@ -106,16 +117,7 @@ class FirstLook:
                     f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit}" for band in shown
                 )
                 parts.append(f"{name}: {said}.")
-        tested = [one for one in self.residuals if not one.held_out]
-        if tested:
-            smallest = min(one.p_white for one in tested)
-            white = smallest * len(tested) >= WHITE_P
-            parts.append(
-                "The residual is compatible with the noise model"
-                if white
-                else "The noise model does not explain the residual"
-            )
-            parts[-1] += f" (smallest p = {smallest:.2g})."
+        parts += [f"{self.whiteness}."] if self.whiteness else []
         parts += [f"{one.reason[0].upper()}{one.reason[1:]}; {one.remedy}." for one in self.before]
         return " ".join([f"Grade {GRADE}: {self.reason}.", *parts, "`fit` samples the posterior."])
 
@@ -127,6 +129,7 @@ class FirstLook:
                 "verdict": self.verdict,
                 "grade": GRADE,
                 "grade_reason": self.reason,
+                "overview": overview_of_look(self),
                 "time_unit": self.problem.study.time_unit,
                 "log_density": self.optimum.log_density,
                 "effective_share": self.share,

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from lcopa_bayes.results.firstlook import FirstLook
     from lcopa_bayes.results.fit import Fit
 
-"""Most parameters named in a sentence."""
 _AT_REST = 8
 """Samples at rest without which their scatter is not shown [-]."""
 
@@ -39,19 +38,33 @@ def overview(fit: Fit) -> dict[str, Any]:
     """
     draws = fit.draws
     graded = [(one.name, one.grade) for one in draws.estimates()]
-    return {
-        "plant": plant(draws.table, draws.flat[int(draws.log_density.argmax())]),
-        "answers": [
-            {"question": question, "answer": answer, "section": section}
-            for question, answer, section in (
-                ("How good is the fit?", _fitted(fit), "Residuals"),
-                ("Does it predict?", _predicted(fit), "Data and bands"),
-                ("Which numbers can be trusted?", grouped(graded), "Parameters"),
-                ("What is missing?", _missing(fit), "Residuals"),
-                ("What next?", _next(fit), ""),
-            )
-        ],
-    }
+    return _overview(
+        plant(draws.table, draws.flat[int(draws.log_density.argmax())]),
+        ("How good is the fit?", _fitted(fit), "Residuals"),
+        ("Does it predict?", _predicted(fit), "Data and bands"),
+        ("Which numbers can be trusted?", grouped(graded), "Parameters"),
+        ("What is missing?", _missing(fit), "Residuals"),
+        ("What next?", _next(fit), ""),
+    )
+
+
+def overview_of_look(look: FirstLook) -> dict[str, Any]:
+    """The same of a first look, with the plant at its best optimum."""
+    rough = f"Roughly, all: {look.reason}."
+    lacking = [one for one in (look.whiteness, *(limit.reason for limit in look.before)) if one]
+    return {"at": "best optimum"} | _overview(
+        plant(look.draws.table, look.optimum.values),
+        ("How good is the fit?", _fitted(look), "Residuals"),
+        ("Does it predict?", _predicted(look), "Data and bands"),
+        ("Which numbers can be trusted?", rough, "Parameters"),
+        ("What is missing?", joined(lacking), "Residuals"),
+        ("What next?", joined([*(one.remedy for one in look.before), "`fit` samples the posterior"]), ""),
+    )
+
+
+def _overview(lines: list[str], *answers: tuple[str, str, str]) -> dict[str, Any]:
+    keys = ("question", "answer", "section")
+    return {"plant": lines, "answers": [dict(zip(keys, one, strict=True)) for one in answers if one[1]]}
 
 
 def plant(table: ParameterTable, values: Vector) -> list[str]:
@@ -85,7 +98,7 @@ def plant(table: ParameterTable, values: Vector) -> list[str]:
     return lines
 
 
-def _fitted(fit: Fit) -> str:
+def _fitted(fit: Fit | FirstLook) -> str:
     parts = []
     for axis, response in enumerate(fit.draws.table.layout.responses):
         own = [band for band in fit.bands if band.axis == response.name and not band.held_out]
@@ -102,7 +115,7 @@ def _fitted(fit: Fit) -> str:
     return ". ".join(parts) + "."
 
 
-def _predicted(fit: Fit) -> str:
+def _predicted(fit: Fit | FirstLook) -> str:
     held = [band for band in fit.bands if band.held_out]
     if not held:
         return "Untested: no record was held out."

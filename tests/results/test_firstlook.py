@@ -110,6 +110,11 @@ def test_a_look_is_saved_read_back_and_drawn_again(tmp_path, capsys):
     assert isinstance(seen, lb.LookResult)
     assert seen.to_json() == json.loads((run / "look.json").read_text())
     assert list(seen.summary()["parameter"])[:2] == ["gain", "time_1"]
+    first = seen.to_json()["overview"]
+    gain = seen.summary()["value"][0]
+    assert float(first["plant"][0].split()[4]) == pytest.approx(gain, rel=0.05)
+    assert {one["question"] for one in first["answers"]} >= {"How good is the fit?", "What next?"}
+    assert b"At the best optimum" in page
     (run / "look.html").unlink()
     assert main(["report", str(run)]) == 0
     assert (run / "look.html").read_bytes() == page
