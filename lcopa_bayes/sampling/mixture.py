@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
@@ -24,6 +24,8 @@ FREEDOM = 5.0
 _ROUNDS, _GAIN = 60, 1e-3
 """Most rounds of expectation maximisation, and gain per point below which they end [nat]: a good cover is
 wanted, not the maximum."""
+_TOGETHER = 1 << 16
+"""Numbers of whitened points that are calculated at once; more no longer fit the cache."""
 _RIDGE = 1e-6
 """Added to the variance of every direction, relative to the draws' own [-]."""
 
@@ -99,41 +101,52 @@ class Mixture:
 
     def log_density(self, points: Matrix) -> Vector:
         """Log density, (n,)."""
-        return np.asarray(logsumexp(self.log_parts(points), axis=0))
+        return np.asarray(np.logaddexp.reduce(self.log_parts(points), axis=0))
 
     def log_parts(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
         """Log density of each component times its weight, (components, n), from `distances` where given."""
         if distances is None:
             distances = self.distances(points)
-        dimension = self.dimension
-        level = (
-            gammaln((FREEDOM + dimension) / 2)
-            - gammaln(FREEDOM / 2)
-            - 0.5 * dimension * np.log(FREEDOM * np.pi)
-        )
-        parts = -0.5 * (FREEDOM + dimension) * np.log1p(distances / FREEDOM)
+        parts = np.log1p(distances / FREEDOM)
+        parts *= -0.5 * (FREEDOM + self.dimension)
+        parts += self._levels[:, None]
+        return parts
+
+    @cached_property
+    def _levels(self) -> Vector:
+        """Log density of each component at its mean times its weight, (components,)."""
+        constant = gammaln((FREEDOM + self.dimension) / 2) - gammaln(FREEDOM / 2)
+        constant -= 0.5 * self.dimension * np.log(FREEDOM * np.pi)
         scale = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(axis=1)
         with np.errstate(divide="ignore"):
-            return np.asarray(parts + (level - scale + np.log(self.weights))[:, None])
+            return np.asarray(constant - scale + np.log(self.weights))
 
     def distances(self, points: Matrix) -> Matrix:
         """Squared Mahalanobis distance from every component, (components, n) [-]."""
-        out = np.empty((self.weights.size, len(points)))
-        for k, whitener in enumerate(self._whiteners):
-            out[k] = ((points @ whitener - self.means[k] @ whitener) ** 2).sum(axis=1)
+        size = self.weights.size, self.dimension
+        out = np.empty((size[0], len(points)))
+        whitener, centre = self._whitener
+        together = max(1, _TOGETHER // centre.size)
+        for first in range(0, len(points), together):
+            some = slice(first, first + together)
+            white = (points[some] @ whitener - centre).reshape(-1, *size)
+            np.einsum("nkd,nkd->kn", white, white, out=out[:, some])
         return out
 
     def log_shares(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
         """Log probability of each component given a point, (components, n); `distances` where these are
         known."""
         parts = self.log_parts(points, distances)
-        return np.asarray(parts - logsumexp(parts, axis=0))
+        return np.asarray(parts - np.logaddexp.reduce(parts, axis=0))
 
     @cached_property
-    def _whiteners(self) -> list[Matrix]:
-        """Transposed inverses of the factors."""
+    def _whitener(self) -> tuple[Matrix, Vector]:
+        """Transposed inverses of the factors beside each other, (dimension, components * dimension), and the
+        means times these."""
         unit = np.eye(self.dimension)
-        return [np.ascontiguousarray(solve_triangular(factor, unit, lower=True).T) for factor in self.factors]
+        each = [solve_triangular(factor, unit, lower=True).T for factor in self.factors]
+        means = [mean @ own for mean, own in zip(self.means, each, strict=True)]
+        return np.concatenate(each, axis=1), np.concatenate(means)
 
 
 def spread_evenly(points: Matrix, most: int) -> Matrix:
