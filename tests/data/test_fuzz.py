@@ -347,7 +347,7 @@ def test_workbooks(place, data):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """The run folder of a fit."""
-    tiny = {"ensembles": 2, "walkers": 16, "steps": 20, "thin": 1, "target_ess": 100}
+    tiny = {"target_ess": 50}
     made = fit(study(record(camera=0.8), sampler=tiny, priors={"delay": 0.73, "order_1": 0.8}))
     return made.save(tmp_path_factory.mktemp("run"))
 

@@ -19,7 +19,7 @@ from lcopa_bayes.plot.theme import BAND, StyledFigure, look
 from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.papers import optics
 
-TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
+TINY = {"target_ess": 50}
 ON = record(1, camera=0.5, name="on")
 OFF = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
 

@@ -19,7 +19,7 @@ from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerfit import integer_fit
 from lcopa_bayes.verbs.fit import fit
 
-QUICK = {"ensembles": 2, "walkers": 16, "steps": 200, "thin": 1, "target_ess": 50}
+QUICK = {"target_ess": 50}
 
 
 def one_term(study: Study) -> Fit:

@@ -14,7 +14,7 @@ from lcopa_bayes.report import write_report
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.integerrival import Rival, integer_rival, integer_study
 
-FEW = SamplerSettings(ensembles=2, walkers=8, steps=100, thin=1, target_ess=10)
+FEW = SamplerSettings(target_ess=10)
 
 
 @pytest.fixture(scope="module")

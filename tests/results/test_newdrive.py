@@ -22,7 +22,7 @@ from lcopa_bayes.results.newdrive import fitted_range, predict
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.summary import results
 
-TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
+TINY = {"target_ess": 50}
 HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
 STEPS = Drive.steps(u=[(0.35, 0.8), (5.0, 0.1)], until=11.0)
 

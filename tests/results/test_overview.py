@@ -66,7 +66,7 @@ def test_answers_follow_the_fit():
         "on", on.time + 5.0, on.drive, on.response, on.drive_axes, on.response_axes, time_unit=on.time_unit
     )
     off = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
-    tiny = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
+    tiny = {"target_ess": 50}
     fitted = fit(study(late, held_out=[off], priors={"delay": 0.73, "order_1": 0.8}, sampler=tiny))
     answers = {one["question"]: one["answer"] for one in overview(fitted)["answers"]}
     (band,) = (one for one in fitted.bands if not one.held_out)

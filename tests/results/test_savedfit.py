@@ -21,7 +21,7 @@ from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.runfolder import fingerprint, settings_of
 from lcopa_bayes.results.savedfit import fit_to_json, load_fit
 
-TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
+TINY = {"target_ess": 50}
 HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held")
 PAIR = (record(1, camera=0.4, name="a/b"), record(2, camera=0.5, name="b"))
 

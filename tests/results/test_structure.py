@@ -25,7 +25,7 @@ from lcopa_bayes.verbs.look import look
 
 LAGS = Device(((path(2.0, 0.4, (1.2, 2.5), (1.6, 0.7)),),), (U,), (Y,), (0.0,))
 """Two terms that steps of 12 ms tell apart."""
-QUICK = {"ensembles": 2, "walkers": 8, "steps": 40, "thin": 1, "target_ess": 10}
+QUICK = {"target_ess": 50}
 
 
 def steps(device: Device, noise_sd: float = 0.01) -> Study:

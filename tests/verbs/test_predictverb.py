@@ -15,7 +15,7 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.results.fit import fit
 
-TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
+TINY = {"target_ess": 50}
 HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held")
 GOOD = "time_ms,drive_u_V\n-1,0\n0,0.8\n3,-0.2\n9,-0.2\n"
 
