@@ -25,7 +25,7 @@ from lcopa_bayes.report.compare import drawn
 from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import plan_of
 
-FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
+FEW = {"target_ess": 100}
 PICK = ("fractional-1", "first-order")
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 

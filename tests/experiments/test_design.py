@@ -357,9 +357,7 @@ fit = ["one.csv"]
 [noise]
 kind = "white"
 [sampler]
-ensembles = 2
-walkers = 32
-steps = 200
+target_ess = 100
 """
 
 

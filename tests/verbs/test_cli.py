@@ -40,8 +40,7 @@ def record(tmp_path) -> Path:
 def study(record: Path, more: str = "") -> Path:
     path = record.parent / "study.toml"
     path.write_text(
-        '[records]\nfit = ["pulse.csv"]\n[noise]\nkind = "white"\n'
-        "[sampler]\nensembles = 2\nwalkers = 16\nsteps = 200\n" + more
+        '[records]\nfit = ["pulse.csv"]\n[noise]\nkind = "white"\n[sampler]\ntarget_ess = 100\n' + more
     )
     return path
 
