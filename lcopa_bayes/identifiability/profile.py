@@ -183,7 +183,9 @@ class _Path:
         self.beyond = _BEYOND * self.freedom.fall_at(max(LEVELS))
         at = min(max(landscape.coordinate(k, peak.values[k]), self.low), self.high)
         self.points: dict[float, Peak] = {at: peak}
-        self.begun: dict[float, list[Peak]] = {}
+        self.begun: dict[
+            float, list[Peak]
+        ] = {}  # what a point was searched from, its neighbours at that time
         self.start = at
         self.witnesses = witnesses
         self.where = landscape.column(k, witnesses) if witnesses.size else np.empty(0)
@@ -198,8 +200,9 @@ class _Path:
         if self.landscape.precision is None:  # else of one mode, and from the posterior itself at the end
             for at in (sorted(self.points), sorted(self.points, reverse=True)):
                 for near, far in pairwise(at):  # from either end through to the other
-                    if not any(self.points[near] is start for start in self.begun.get(far, ())):
-                        self.improve(far, self.points[near].values)
+                    start = self.points[near]
+                    if not any(start is before for before in self.begun.get(far, ())):
+                        self.improve(far, start.values)
             self.from_draws()
             self.extend_ends()
             self.refine()
