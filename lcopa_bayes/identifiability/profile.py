@@ -183,9 +183,7 @@ class _Path:
         self.beyond = _BEYOND * self.freedom.fall_at(max(LEVELS))
         at = min(max(landscape.coordinate(k, peak.values[k]), self.low), self.high)
         self.points: dict[float, Peak] = {at: peak}
-        self.begun: dict[
-            float, list[Peak]
-        ] = {}  # what a point was searched from, its neighbours at that time
+        self.begun: dict[float, list[Peak]] = {}  # neighbours that a point was searched from
         self.start = at
         self.witnesses = witnesses
         self.where = landscape.column(k, witnesses) if witnesses.size else np.empty(0)
