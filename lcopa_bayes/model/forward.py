@@ -94,7 +94,8 @@ class Experiment:
         drives = axis_drives(record)
         begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
         mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
-        return cls(record.name, mesh, drives, record.drive[0])
+        aligned = tuple(AxisDrive(mesh.lattice.aligned(drive.times), drive.values) for drive in drives)
+        return cls(record.name, mesh, aligned, record.drive[0])
 
     @cached_property
     def circle(self) -> Circle:

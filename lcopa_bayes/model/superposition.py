@@ -30,6 +30,8 @@ _SHARED = 0.5
 _PLACES = round(1.0 / _SAME_PHASE)
 _TOGETHER = 1 << 17
 """Numbers of a step response times phases or changes that are read at once; more no longer fit the cache."""
+_KEPT = 1 << 16
+"""Blocks up to which the spectrum of a phase is kept: those of 24 phases are no more than 25 MB."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -45,6 +47,20 @@ class Phase:
     """Whole blocks from there to each, increasing."""
     jumps: Vector
     """Change of the drive at each [drive unit]."""
+    spectra: dict[int, Spectrum] = field(default_factory=dict, repr=False)
+    """Spectra of the jumps by the number of blocks, where these are few."""
+
+    def spectrum(self, circle: Circle) -> Spectrum:
+        """Spectrum of the jumps on the blocks of `circle`; those beyond its last block are left out."""
+        if circle.n in self.spectra:
+            return self.spectra[circle.n]
+        train = np.zeros(circle.n)
+        inside = self.blocks < circle.n
+        np.add.at(train, self.blocks[inside], self.jumps[inside])  # two changes may share a block
+        spectrum = circle.spectrum(train)
+        if circle.n <= _KEPT:
+            self.spectra[circle.n] = spectrum
+        return spectrum
 
 
 def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
@@ -203,15 +219,8 @@ class Superposition:
 
     def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
         """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
-        total = self.circle.coefficients(self.circle.spectrum(response.coarse) * self._train(phase))
-        return response.beyond(total)
-
-    def _train(self, phase: Phase) -> Spectrum:
-        """Spectrum of the jumps of a phase."""
-        train = np.zeros(self.circle.n)
-        inside = phase.blocks < self.circle.n
-        np.add.at(train, phase.blocks[inside], phase.jumps[inside])  # two changes may share a block
-        return self.circle.spectrum(train)
+        spectrum = self.circle.spectrum(response.coarse) * phase.spectrum(self.circle)
+        return response.beyond(self.circle.coefficients(spectrum))
 
     def _add_on_lattice(
         self, out: Array, phase: Phase, origin: Vector, read: _Read, lattice: Lattice
@@ -224,7 +233,7 @@ class Superposition:
         if phase.blocks.size > _ADDED:
             missing = ((0, 0), (0, 0), (0, self.circle.n - read.size))
             spectrum = self.circle.spectrum(np.pad(read.padded[:, :, read.size :], missing))
-            total = self.circle.coefficients(spectrum * self._train(phase))
+            total = self.circle.coefficients(spectrum * phase.spectrum(self.circle))
             out += _Read.of(read.origin, total).take(start, lattice.chosen, length)
             return
         for shift, jump in zip(phase.blocks, phase.jumps, strict=True):

@@ -348,6 +348,27 @@ def test_records_on_blocks_of_any_width_are_as_if_each_stood_alone(rng):
             assert_allclose(own, wanted, rtol=0, atol=1e-9)
 
 
+def test_rounded_time_stamps_are_one_clock(rng):
+    """A drive that changes in every row costs one phase, and its response is that of the exact clock."""
+    time = 0.48828125 * np.arange(300)
+    drive = rng.normal(size=(300, 1))
+    layout = Layout.of((X,), (X,), ModelSettings(terms=1))
+    models = [
+        forward_model(layout, [Record("r", at, drive, drive, (X,), (Y,), "ms")], [at])
+        for at in (time, np.round(time, 6))
+    ]
+    assert [len(model.experiments[0].phases[0]) for model in models] == [1, 1]
+    dynamics = Dynamics((np.array([[4.0]]),), (np.array([[0.9]]),), np.array([[0.7]]))
+    exact, rounded = (model.unit_responses(dynamics)[0] for model in models)
+    assert_allclose(rounded, exact, rtol=0, atol=1e-5)
+
+
+def test_a_change_that_is_not_on_the_clock_stays_where_it_is():
+    lattice = Mesh.of_samples(0.1 * np.arange(300), 0.5).lattice
+    beside = np.array([0.5, 0.5 + 2e-5, 0.502, 0.55])
+    assert_allclose(lattice.aligned(beside), [0.5, 0.5, 0.502, 0.55], rtol=0, atol=1e-12)
+
+
 # Derivatives
 
 
