@@ -151,8 +151,9 @@ class _Work:
         return plain(outcome)
 
     def lost(self, one: tuple[str, Study], error: BaseException) -> dict[str, Any]:
-        """A device whose worker was lost."""
-        return _failed(one[1].name, one[0], f"{type(error).__name__}: {error}")
+        """A device whose worker was lost; of what a library says of it the first sentence."""
+        said = str(error).partition(". ")[0] or type(error).__name__
+        return _failed(one[1].name, one[0], f"its worker was lost, perhaps for want of memory ({said})")
 
     def done(self, study: Study) -> dict[str, Any] | None:
         """The stored outcome of a device; None where there is none, or its study has changed: what a device

@@ -143,6 +143,15 @@ def without_times(fleet: lb.FleetResult) -> dict:
     return {key: value for key, value in fleet.to_json().items() if key != "seconds"}
 
 
+def test_a_lost_worker_is_said_in_words(tmp_path):
+    killed = RuntimeError("Attempted to run task 'a' on 4 different workers, but all died. Inspect the logs.")
+    work = verb._Work("fit", tmp_path, quick=True, resume=False)
+    row = work.lost(("devices/a", lb.Study("a", fit=[record()])), killed)["row"]
+    assert row["grade"] == "failed"
+    assert row["reason"].startswith("its worker was lost, perhaps for want of memory (Attempted")
+    assert "Inspect" not in row["reason"]
+
+
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_table(fleet, devices, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
