@@ -196,11 +196,7 @@ class _Path:
             self.seek(side)
         self.refine()
         if self.landscape.precision is None:  # else of one mode, and from the posterior itself at the end
-            for at in (sorted(self.points), sorted(self.points, reverse=True)):
-                for near, far in pairwise(at):  # from either end through to the other
-                    start = self.points[near]
-                    if not any(start is before for before in self.begun.get(far, ())):
-                        self.improve(far, start.values)
+            self.from_neighbours()
             self.from_draws()
             self.extend_ends()
             self.refine()
@@ -303,6 +299,15 @@ class _Path:
                 self.extend(u, -side, step) if abs(u - last) > 0 else None
                 self.extend(u, side, step)
                 last = max(self.points) if side > 0 else min(self.points)
+
+    def from_neighbours(self) -> None:
+        """Every point once more from its neighbour, from either end through to the other; not from what it
+        was searched from before."""
+        for at in (sorted(self.points), sorted(self.points, reverse=True)):
+            for near, far in pairwise(at):
+                start = self.points[near]
+                if not any(start is before for before in self.begun.get(far, ())):
+                    self.improve(far, start.values)
 
     def from_draws(self) -> None:
         """Every point once more from the most likely draw near it."""

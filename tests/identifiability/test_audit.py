@@ -232,6 +232,24 @@ def test_a_profile_is_extended_from_an_end_that_is_inside():
     assert min(outermost) > path.beyond
 
 
+def test_points_are_searched_again_from_the_neighbours_they_did_not_begin_at(monkeypatch):
+    known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"]}
+    landscape = Landscape(problem(SHORT, priors=known).posterior)
+    peak = landscape.maximise(np.array([TRUTH[name] for name in landscape.posterior.table.names]))
+    k = landscape.posterior.table.names.index("gain")
+    path = _Path(landscape, k, peak, np.empty((0, peak.values.size)))
+    for side in (-1, 1):
+        path.extend(path.start, side, 1e-3)
+    at = sorted(path.points)
+    again = list[tuple[float, float]]()
+    monkeypatch.setattr(path, "improve", lambda u, start: again.append((u, float(start[k]))))
+    path.from_neighbours()
+    pairs = [sorted(pair, key=lambda one: abs(one - path.start)) for pair in pairwise(at)]
+    wanted = {(inner, outer) for inner, outer in pairs}
+    assert len(wanted) > 8
+    assert {(u, min(at, key=lambda one: abs(one - start))) for u, start in again} == wanted
+
+
 def test_profile_of_a_noise_scale_is_its_closed_form():
     posterior = problem(SHORT, priors=KNOWN | {"gain": FLAT_GAIN}).posterior
     landscape = Landscape(posterior)
