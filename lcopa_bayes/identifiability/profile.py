@@ -305,9 +305,8 @@ class _Path:
         was searched from before."""
         for at in (sorted(self.points), sorted(self.points, reverse=True)):
             for near, far in pairwise(at):
-                start = self.points[near]
-                if not any(start is before for before in self.begun.get(far, ())):
-                    self.improve(far, start.values)
+                if self.points[near] not in self.begun.get(far, ()):
+                    self.improve(far, self.points[near].values)
 
     def from_draws(self) -> None:
         """Every point once more from the most likely draw near it."""

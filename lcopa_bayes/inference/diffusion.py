@@ -25,7 +25,7 @@ Kind = Literal["lags", "wall", "layer"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 _MODES = 60
 """Lags of a series; what the others add is in the last [-]."""
-_TABULATED = 8192
+_TABULATED = 1 << 15
 """Places between which the response of a series is linear in the root of time [-]."""
 
 
@@ -42,7 +42,7 @@ def series(kind: Kind) -> tuple[Vector, Vector]:
 
 def rises(kind: Kind, since: Array, time: Array) -> Array:
     """Share of the steady response `since` the delay after a step, with the slowest time constant `time`, in
-    the shape of both together; of diffusion to 1e-5."""
+    the shape of both together; of diffusion to 1e-6."""
     if kind == "lags":
         return np.asarray(-np.expm1(-since / time))
     return np.interp(np.sqrt(since / time), *_tabulated(kind))

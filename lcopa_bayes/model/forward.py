@@ -211,13 +211,8 @@ class ForwardModel:
         if absent((element, step)):
             batch = dynamics.batch
             some = [*filter(absent, self._evaluated[element, step])] if batch == 1 else [(element, step)]
-            times, orders = (
-                np.concatenate(parts)
-                for parts in (
-                    [dynamics.times[one] / width for one, width in some],
-                    [dynamics.orders[one] for one, _ in some],
-                )
-            )
+            times = np.concatenate([dynamics.times[one] / width for one, width in some])
+            orders = np.concatenate([dynamics.orders[one] for one, _ in some])
             longest = max((self.circles[width] for _, width in some), key=lambda circle: circle.n)
             found = step_response(times, orders, longest, 1.0, slopes=slopes)
             for place, one in enumerate(some):

@@ -101,9 +101,8 @@ class FirstLook:
         if not tested:
             return ""
         white = min(tested) * len(tested) >= WHITE_P
-        said = "The residual is compatible with the noise model"
-        said = said if white else "The noise model does not explain the residual"
-        return f"{said} (smallest p = {min(tested):.2g})"
+        found = "residual is compatible with the noise model", "noise model does not explain the residual"
+        return f"The {found[not white]} (smallest p = {min(tested):.2g})"
 
     @property
     def verdict(self) -> str:

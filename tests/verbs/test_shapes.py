@@ -74,8 +74,8 @@ def verbs(folder: Path, *, pick: tuple[str, ...] = ()) -> dict[str, tuple[object
 def answers(
     capsys: pytest.CaptureFixture[str], folder: Path, *, pick: tuple[str, ...] = ()
 ) -> dict[str, dict]:
-    """Of every verb, each in a folder of its own."""
-    of_fit = ("fit", "predict", "audit", "design")  # in one folder, so that the page of the fit is there
+    """Of every verb, each in a folder of its own but for those of the fit, whose page is drawn once."""
+    of_fit = ("fit", "predict", "audit", "design")
     return {
         verb: answer(capsys, verb, *words, "--out", folder / ("run" if verb in of_fit else verb))
         for verb, words in verbs(folder, pick=pick).items()
