@@ -80,11 +80,12 @@ def integration_weights(orders: Vector, n: int, step: float) -> Matrix:
     return out
 
 
-def integration_weights_slope(orders: Vector, n: int, step: float) -> Matrix:
-    """Derivative of `integration_weights` in the order; same shapes, [time unit^order].
+def integration_weights_and_slopes(orders: Vector, n: int, step: float) -> tuple[Matrix, Matrix]:
+    """`integration_weights` to the last bit, and their derivatives in the order, [time unit^order] too.
 
-    Accuracy: 1e-12 of ``w[0] max(1, n^(a-1)) max(1, |log step|)``.
+    Accuracy of the derivatives: 1e-12 of ``w[0] max(1, n^(a-1)) max(1, |log step|)``.
     """
+    weights = integration_weights(orders, n, step)
     q = orders + 1
     out = np.empty((orders.size, n))
     out[:, 0] = 0.0
@@ -93,14 +94,18 @@ def integration_weights_slope(orders: Vector, n: int, step: float) -> Matrix:
     log_p = np.log(np.maximum(p, 1.0))  # p = 0 contributes 0 to p^q log p for q > 0
     powers = p ** q[:, None] * log_p
     out[:, 1:head] = powers[:, 2:] - 2 * powers[:, 1:-1] + powers[:, :-2]
-    if n > _DIRECT:
-        log_m, basis = _tail_basis(n)
-        values, slopes = _series_coefficients(q), _series_coefficient_slopes(q)
-        growth = np.exp((q - 2)[:, None] * log_m)
-        out[:, _DIRECT:] = growth * (log_m * (values @ basis) + slopes @ basis)
     scale = (step**orders / gamma(orders + 2))[:, None]
-    weights = integration_weights(orders, n, step)
-    return np.asarray(out * scale + weights * (np.log(step) - digamma(orders + 2))[:, None])
+    out[:, :head] *= scale
+    if n > _DIRECT:
+        # of the product of a power and a series, whose value is known
+        log_m, basis = _tail_basis(n)
+        tail = np.multiply((q - 2)[:, None], log_m, out=out[:, _DIRECT:])
+        np.exp(tail, out=tail)
+        tail *= _series_coefficient_slopes(q) @ basis
+        tail *= scale
+        tail += weights[:, _DIRECT:] * log_m
+    out += weights * (np.log(step) - digamma(orders + 2))[:, None]
+    return weights, out
 
 
 def integration_matrix(order: float, n: int, step: float) -> Matrix:
@@ -169,7 +174,7 @@ class Circle:
     @cached_property
     def smoothing(self) -> Spectrum:
         """``1 + (1 - z)^2 (2 - z) / 12`` on the circle, no zero inside: the factor by which integrals of
-        block pulses are too large, whatever their order; more depends on the order (`stepresponse`)."""
+        block pulses are too large, whatever their order; more depends on the order (`leftover`)."""
         return np.asarray(1.0 + self.difference**2 * (1.0 + self.difference) / 12.0)
 
     @cached_property

@@ -8,12 +8,6 @@ two and a half of the narrowest blocks the leading power of the onset takes over
 Measured against high-precision inversions of the Laplace transform for orders 0.3 to 2 and blocks of 0.03 of
 the time constant: 1e-4 of the step or better right after the onset for orders above 0.5, where the same
 blocks laid over the onset and read by a parabola are off by several percent.
-
-An element as a quotient of power series, with its exact derivatives.
-
-Numerator and denominator are both multiplied by ``1 - z``, z one block of delay. The weights of an
-integral of order above 1 grow; cut off after n blocks they would put zeros of the denominator inside
-the circle and spoil up to four digits of every block. Their differences do not grow up to order 2.
 """
 
 from __future__ import annotations
@@ -24,137 +18,10 @@ from typing import Literal, final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import zeta
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, integration_weights_slope
-
-
-def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
-    """``1 + sum_i (i w T_i)^order_i``, (batch, frequencies), at angular frequencies w (frequencies,).
-
-    Parameters: times [time unit] and orders [-], (batch, terms); angular [1 / time unit].
-    Its terms have arguments within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal
-    argument is the continuous one.
-    """
-    out = np.ones((times.shape[0], angular.size), dtype=np.complex128)
-    for time, order in zip(times.T, orders.T, strict=True):
-        out += (1j * angular * time[:, None]) ** order[:, None]
-    return out
-
-
-def transfer(
-    times: Array, orders: Matrix, circle: Circle, step: float, *, corrected: bool = False
-) -> Spectrum:
-    r"""``1 / (1 + sum_i (T_i s)^order_i)`` integrated order_1 times (Ta et al. 2026, Eqs. 59-61).
-
-    :math:`P^{a_1} / (P^{a_1} + \sum_i T_i^{a_i} P^{a_1 - a_i})` with block-pulse integrals P^a,
-    evaluated on the circle. `corrected`: the response is integrated without the two leading errors of P^a
-    (`_leftover`); the drive, constant from the first edge on, by P^a, which is exact for constants.
-
-    Parameters: times (..., batch, terms) [time unit] and orders (batch, terms) [-], not increasing along a
-    row; step [time unit] block width. Returns: (..., batch, length // 2 + 1).
-    Accuracy: the dense matrix quotient to 2e-9 (typically 1e-12); the true response to O(step^2), corrected
-    to O(step^3) or better for orders above 0.8, and below to typically a fifth. Useless for an element
-    whose time constants are all below about 0.3 step (corrected and undamped, of order 2, below 3 steps) when
-    its top order exceeds 1: the block-pulse scheme is then unstable and needs shorter blocks.
-    """
-    top, denominator, *_ = _parts(times, orders, circle, step, corrected)
-    inverse = np.divide(1.0, denominator, out=denominator)
-    return np.multiply(top, inverse, out=inverse)  # to the last bit as in `transfer_slopes`
-
-
-def transfer_slopes(
-    times: Array,
-    orders: Matrix,
-    circle: Circle,
-    step: float,
-    *,
-    in_orders: bool = True,
-    corrected: bool = False,
-) -> Spectrum:
-    """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
-    order: rows of one array, (1 + terms or 1 + 2 terms, ..., batch, length // 2 + 1)."""
-    top, denominator, integrals, scale = _parts(times, orders, circle, step, corrected)
-    terms = orders.shape[1]
-    out = np.empty((1 + terms * (1 + in_orders), *denominator.shape), dtype=np.complex128)
-    inverse = np.divide(1.0, denominator, out=denominator)
-    value = np.multiply(top, inverse, out=out[0])
-    falling = -value
-    falling *= inverse  # the derivative of the quotient in its denominator
-    by_time, by_order = out[1 : 1 + terms], out[1 + terms :]
-    for i, integral in enumerate(integrals):
-        part = np.multiply(falling, integral, out=by_time[i])
-        part *= scale[i]
-        if in_orders:
-            np.multiply(part, np.log(times[..., i, None] / step), out=by_order[i])
-        part *= orders[:, i, None]
-    if not in_orders:
-        return out
-    integrated = _integrated(orders)
-    weights = integration_weights_slope(integrated.ravel(), circle.n, 1.0)
-    slopes = _differenced(weights, circle).reshape(*orders.shape, -1)
-    driven = slopes[:, 0]
-    if corrected:
-        driven = driven * circle.smoothing
-        slopes -= _leftover(integrated, slope=True)[..., None] * circle.bend
-    leading = np.broadcast_to(slopes[:, 0], value.shape).copy()
-    for i in range(1, terms):
-        bent = scale[i] * slopes[:, i]
-        leading += bent
-        bent *= falling
-        by_order[i] -= bent
-    by_order[0] += np.multiply(leading, falling, out=leading)
-    by_order[0] += np.multiply(driven, inverse, out=inverse)
-    return out
-
-
-def _parts(
-    times: Array, orders: Matrix, circle: Circle, step: float, corrected: bool
-) -> tuple[Spectrum, Spectrum, list[Spectrum], list[Array]]:
-    """P^a1, the denominator, and P^(a1 - ai) of every term, all times ``1 - z``, in blocks of width 1;
-    `corrected` all are multiplied by `Circle.smoothing` too. Last ``(T / step)^order`` of every term, each
-    (..., batch, 1) [-]."""
-    powers = (times / step) ** orders
-    scale = [powers[..., i, None] for i in range(orders.shape[1])]
-    integrated = _integrated(orders)
-    weights = integration_weights(integrated.ravel(), circle.n, 1.0)
-    spectra = _differenced(weights, circle).reshape(*orders.shape, -1)
-    top, same = spectra[:, 0], circle.difference
-    if corrected:
-        top, same = top * circle.smoothing, circle.smoothed
-        spectra -= _leftover(integrated)[..., None] * circle.bend
-    integrals = [same, *(spectra[:, i] for i in range(1, orders.shape[1]))]
-    denominator = np.asarray(scale[0] * same)
-    denominator += spectra[:, 0]
-    for factor, integral in zip(scale[1:], integrals[1:], strict=True):
-        denominator += factor * integral
-    return top, denominator, integrals, scale
-
-
-def _integrated(orders: Matrix) -> Matrix:
-    """How many times the drive and each term but the first are integrated, (batch, terms) [-]."""
-    return np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
-
-
-def _leftover(orders: Matrix, *, slope: bool = False) -> Matrix:
-    r"""``zeta(-a - 1) / Gamma(a + 2)`` of orders a, or its `slope` in a to 1e-8, same shape [-].
-
-    With z = exp(-x), P^a is ``x^-a (1 + x^2 / 12 + leftover x^(2 + a) + O(x^(3 + a)) + O(x^4))`` on blocks of
-    width 1, from the expansion of the polylogarithm about z = 1; at a = 0 both cancel. By the reflection of
-    zeta it is ``-2 (2 pi)^(-a - 2) cos(pi a / 2) zeta(a + 2)``.
-    """
-    if slope:
-        return (_leftover(orders + _NUDGE) - _leftover(orders - _NUDGE)) / (2 * _NUDGE)
-    powers = (2 * np.pi) ** (-orders - 2)
-    return np.asarray(-2 * powers * np.cos(np.pi * orders / 2) * zeta(orders + 2))
-
-
-def _differenced(weights: Matrix, circle: Circle) -> Spectrum:
-    """``1 - z`` times the series of these weights, which are overwritten."""
-    weights[:, 1:] -= weights[:, :-1]
-    return circle.spectrum(weights)
-
+from lcopa_bayes.model.blockpulses import Circle
+from lcopa_bayes.model.powerseries import Integrals, transfer, transfer_slopes
 
 Kind = Literal["integral", "value", "slope"]
 """What is read: the running integral from the onset [blocks], the value, or the derivative [per block]."""
@@ -170,8 +37,6 @@ _FINE = _RATIO * _NEAR + 4
 """Blocks of a finer level: what the coarser one hands over, and the neighbours that reading needs."""
 _POWER = 2.5
 """Blocks of the finest level below which the response is taken as its leading power of time."""
-_NUDGE = 1e-4
-"""Step of a central difference in an order [-]."""
 _SIDE = 2
 """Blocks on either side of the one that is read."""
 
@@ -375,8 +240,9 @@ def step_response(
     for, `transfer` says.
     """
     scale = float(_RATIO) ** np.arange(1, _LEVELS + 1)
-    coarse = _means(times / step, orders, circle, slopes=slopes)
-    fine = _means(times / step * scale[:, None, None], orders, _FINE_CIRCLE, slopes=slopes)
+    integrals = Integrals(orders, max(circle.n, _FINE), in_orders=slopes == "all")  # blocks of any width
+    coarse = _means(times / step, integrals, circle, slopes)
+    fine = _means(times / step * scale[:, None, None], integrals, _FINE_CIRCLE, slopes)
     for level in range(_LEVELS - 2, -1, -1):
         _hand_over(fine[:, level + 1], fine[:, level])
     _hand_over(fine[:, 0], coarse)
@@ -390,11 +256,11 @@ def _hand_over(narrow: Array, wide: Array) -> None:
     wide[..., :count] = parts.mean(axis=-1)
 
 
-def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: Slopes) -> Array:
+def _means(times: Array, integrals: Integrals, circle: Circle, slopes: Slopes) -> Array:
     """Block means of the step responses, (rows, ..., n); times in blocks."""
     if slopes is None:
-        spectra = transfer(times, orders, circle, 1.0, corrected=True)[None]
+        spectra = transfer(times, integrals, circle, corrected=True)[None]
     else:
-        spectra = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all", corrected=True)
+        spectra = transfer_slopes(times, integrals, circle, in_orders=slopes == "all", corrected=True)
     spectra *= circle.running  # a unit step from the first block on
     return circle.coefficients(spectra)

@@ -27,7 +27,7 @@ from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.model.stepresponse import denominator
+from lcopa_bayes.model.powerseries import denominator
 from lcopa_bayes.results.bands import LEVELS
 from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.results.residuals import WHITE_P, Residual

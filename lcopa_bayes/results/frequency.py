@@ -15,7 +15,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.model.stepresponse import denominator
+from lcopa_bayes.model.powerseries import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws

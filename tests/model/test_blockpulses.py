@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lcopa_bayes.model.blockpulses import (
     integration_matrix,
     integration_weights,
-    integration_weights_slope,
+    integration_weights_and_slopes,
     lower_toeplitz,
 )
 
@@ -74,7 +74,7 @@ def test_whole_orders_are_known():
 @orders_of
 def test_slope_in_the_order_is_that_of_the_exact_weight(order):
     n, step = 2000, 0.0123
-    slope = integration_weights_slope(np.array([order]), n, step)[0]
+    slope = integration_weights_and_slopes(np.array([order]), n, step)[1][0]
     exact = [
         mpmath.diff(partial(exact_weight, place=place, step=step), mpmath.mpf(order), h=mpmath.mpf("1e-13"))
         for place in PLACES
@@ -89,16 +89,19 @@ def test_slope_in_the_order_agrees_with_differences(order, n, step):
     nudge = 1e-5
     late, early = (weights(order + sign * nudge, n, step) for sign in (1, -1))
     scale = weights(order, n, step).max() * (1 + abs(np.log(step)) + np.log(n)) ** 3
-    slope = integration_weights_slope(np.array([order]), n, step)[0]
+    slope = integration_weights_and_slopes(np.array([order]), n, step)[1][0]
     assert_allclose(slope, (late - early) / (2 * nudge), atol=1e-8 * scale, rtol=0)
 
 
 def test_a_batch_is_its_members():
     batch = np.array([0.0, 0.4, 1.7, 2.0])
-    for calculate in (integration_weights, integration_weights_slope):
-        together = calculate(batch, 40, 0.1)
-        for row, order in zip(together, batch, strict=True):
-            assert_allclose(row, calculate(np.array([order]), 40, 0.1)[0], rtol=1e-13, atol=1e-15)
+    together = integration_weights_and_slopes(batch, 40, 0.1)
+    assert_array_equal(together[0], integration_weights(batch, 40, 0.1))
+    for k, order in enumerate(batch):
+        for rows, alone in zip(
+            together, integration_weights_and_slopes(np.array([order]), 40, 0.1), strict=True
+        ):
+            assert_allclose(rows[k], alone[0], rtol=1e-13, atol=1e-15)
 
 
 def test_composition_gap_is_first_order():

@@ -16,7 +16,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.model.stepresponse import denominator
+from lcopa_bayes.model.powerseries import denominator
 from lcopa_bayes.paper.paths import response_to
 
 PATHS = {name: getattr(PAPER.plant, name) for name in ("xx", "xy", "yx", "yy")}

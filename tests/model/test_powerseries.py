@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_triangular
 
-from lcopa_bayes.model.blockpulses import Circle, integration_matrix, lower_toeplitz
-from lcopa_bayes.model.stepresponse import transfer, transfer_slopes
+from lcopa_bayes.model.blockpulses import Circle, integration_matrix, integration_weights, lower_toeplitz
+from lcopa_bayes.model.powerseries import Integrals, leftover, transfer, transfer_slopes
 
 
 def fast(times: np.ndarray, orders: np.ndarray, drive: np.ndarray, step: float) -> np.ndarray:
     circle = Circle(drive.size)
-    value = transfer(times[None], orders[None], circle, step)
+    value = transfer(times[None] / step, Integrals(orders[None], circle.n), circle)
     return circle.coefficients(value * circle.spectrum(drive[None]))[0]
 
 
@@ -109,9 +109,25 @@ def test_circle_gives_back_what_it_took(n):
     assert_allclose(circle.difference, difference, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("order", [0.3, 0.6, 1.0, 1.5, 2.0])
+def test_corrected_integrals_are_those_of_smooth_functions(order):
+    """z = exp(-x) delays by a block of width 1; the integral is x^-a, block pulses are off by x^2/12."""
+    circle = Circle(20_000)
+    x = -np.log1p(-circle.difference)
+    near = [int(np.argmin(np.abs(np.abs(x) - size))) for size in (0.1, 0.2)]
+    weights = integration_weights(np.array([order]), circle.n, 1.0)[0]
+    plain = circle.spectrum(np.diff(weights, prepend=0.0)) / circle.difference
+    left = float(leftover(np.array([[order]]))[0, 0])
+    better = (plain - left * circle.bend / circle.difference) / circle.smoothing
+    uncorrected, off = ((each * x**order - 1.0)[near] for each in (plain, better))
+    assert_allclose(uncorrected, x[near] ** 2 / 12 + left * x[near] ** (2 + order), rtol=0.08)
+    assert np.log2(np.abs(off[1] / off[0])) > min(3.0 + order, 4.0) - 0.2
+
+
 def read(element: tuple[np.ndarray, np.ndarray], drive: np.ndarray, step: float) -> list[np.ndarray]:
     circle = Circle(drive.size)
-    parts = transfer_slopes(element[0][None], element[1][None], circle, step)
+    integrals = Integrals(element[1][None], circle.n, in_orders=True)
+    parts = transfer_slopes(element[0][None] / step, integrals, circle)
     return [circle.coefficients(part * circle.spectrum(drive[None]))[0] for part in parts]
 
 

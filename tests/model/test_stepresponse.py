@@ -12,12 +12,12 @@ from lcopa_bayes.bench.inversion import unit_ramp, unit_step
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
-from lcopa_bayes.model.blockpulses import Circle, integration_weights
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.stepresponse import Slopes, StepResponse, _leftover, step_response, taps
+from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response, taps
 from lcopa_bayes.model.superposition import phases
 
 STEP, BLOCKS = 0.1, 160
@@ -85,21 +85,6 @@ def test_errors_fall_with_the_third_or_fourth_power_of_the_width(element):
     slope = np.log2(first / last) / 3  # right after the onset the place of a sample in its block matters too
     assert (1.9 if element[1][0] < 0.7 else 2.9) < slope < 4.1
     assert last < 5e-7
-
-
-@pytest.mark.parametrize("order", [0.3, 0.6, 1.0, 1.5, 2.0])
-def test_corrected_integrals_are_those_of_smooth_functions(order):
-    """z = exp(-x) delays by a block of width 1; the integral is x^-a, block pulses are off by x^2/12."""
-    circle = Circle(20_000)
-    x = -np.log1p(-circle.difference)
-    near = [int(np.argmin(np.abs(np.abs(x) - size))) for size in (0.1, 0.2)]
-    weights = integration_weights(np.array([order]), circle.n, 1.0)[0]
-    plain = circle.spectrum(np.diff(weights, prepend=0.0)) / circle.difference
-    leftover = _leftover(np.array([[order]]))[0, 0]
-    better = (plain - leftover * circle.bend / circle.difference) / circle.smoothing
-    uncorrected, off = ((each * x**order - 1.0)[near] for each in (plain, better))
-    assert_allclose(uncorrected, x[near] ** 2 / 12 + leftover * x[near] ** (2 + order), rtol=0.08)
-    assert np.log2(np.abs(off[1] / off[0])) > min(3.0 + order, 4.0) - 0.2
 
 
 @settings(max_examples=25, deadline=None)

@@ -15,7 +15,7 @@ from scipy.integrate import quad
 from lcopa_bayes.model.blockpulses import Circle, integration_matrix
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.stepresponse import transfer
+from lcopa_bayes.model.powerseries import Integrals, transfer
 from lcopa_bayes.paper.numericsclaims import (
     WaveletBasis,
     block_pulse_response,
@@ -123,7 +123,7 @@ def test_wavelet_block_pulse_and_fast_forms_agree(element, n):
     assert_allclose(wavelet, plain, atol=1e-9 * max(scale, 1e-300))
     circle = Circle(n)
     late = np.concatenate((np.zeros(blocks), drive))[:n]
-    quotient = transfer(np.array([path.times]), np.array([orders]), circle, span / n)
+    quotient = transfer(np.array([path.times]) * n / span, Integrals(np.array([orders]), n), circle)
     fast = b / k * circle.coefficients(quotient * circle.spectrum(late))[0]
     assert_allclose(fast, plain, atol=1e-9 * b / k)
 

@@ -25,7 +25,7 @@ from lcopa_bayes.model.effects.effect import (
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
 from lcopa_bayes.model.grid import CUBIC
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.stepresponse import transfer
+from lcopa_bayes.model.powerseries import Integrals, transfer
 
 Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
@@ -209,7 +209,7 @@ class Passage:
         if key not in self.kernels or self.kernels[key].shape[1] < n:
             times, orders = self.dynamics.times[element], self.dynamics.orders[element]
             circle = Circle(n)
-            spectrum = transfer(self.stretch * times, orders, circle, step)
+            spectrum = transfer(self.stretch * times / step, Integrals(orders, n), circle)
             self.kernels[key] = circle.coefficients(spectrum)
         return self.kernels[key][:, :n]
 
@@ -226,7 +226,8 @@ class Passage:
                 late = self.dynamics.delays[:, delay]
                 means = self.scene.drives[axis].block_means(self.experiment.edges, late)[0]
                 times, orders = self.dynamics.times[element], self.dynamics.orders[element]
-                spectrum = transfer(stretch * times, orders, circle, step) * circle.spectrum(means)
+                spectrum = transfer(stretch * times / step, Integrals(orders, circle.n), circle)
+                spectrum *= circle.spectrum(means)
                 out[i] += self.gains[:, i, j, None] * circle.coefficients(spectrum)
         return out
 

@@ -12,7 +12,7 @@ from lcopa_bayes.model.effects.effect import Ranges
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.forward import Experiment, ForwardModel, deflections
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.stepresponse import transfer
+from lcopa_bayes.model.powerseries import Integrals, transfer
 
 _BLOCKS = 2048
 
@@ -72,6 +72,6 @@ def _speed(plant: Plant, element: int, span: float) -> float:
     """Time to half of the deflection that a step reaches within `span` [time unit]."""
     step, circle = span / _BLOCKS, Circle(_BLOCKS)
     times, orders = plant.dynamics.times[element], plant.dynamics.orders[element]
-    spectrum = transfer(times, orders, circle, step)[0]
+    spectrum = transfer(times / step, Integrals(orders, _BLOCKS), circle)[0]
     response = circle.coefficients(spectrum * circle.spectrum(np.ones(_BLOCKS)))
     return float((np.argmax(np.abs(response) >= 0.5 * abs(response[-1])) + 1) * step)
