@@ -302,19 +302,30 @@ class LeastSquares:
 
     def noise_fits(self, values: Vector) -> list[NoiseFit]:
         """Posterior of the noise parameters of each response axis given the residual of a plant."""
+        return self.noise_fits_of(values[None])[0]
+
+    def noise_fits_of(self, values: Matrix) -> list[list[NoiseFit]]:
+        """The same of each plant of a batch."""
         posterior, table = self.posterior, self.posterior.table
-        units = posterior.responses(values[None])
+        units, axes = posterior.responses(values), range(len(table.layout.responses))
+        misfits = [
+            [
+                posterior.residual(axis, r, samples.axes[axis], values, units[r])
+                for r, samples in enumerate(posterior.samples)
+            ]
+            for axis in axes
+        ]
         return [
-            NoiseFit(
-                posterior.noise,
-                tuple(table.rows[table.at(name, axis)] for name in posterior.noise.names),
-                [
-                    posterior.residual(axis, r, samples.axes[axis], values[None], units[r])[0]
-                    for r, samples in enumerate(posterior.samples)
-                ],
-                [samples.axes[axis].gaps for samples in posterior.samples],
-            )
-            for axis in range(len(table.layout.responses))
+            [
+                NoiseFit(
+                    posterior.noise,
+                    tuple(table.rows[table.at(name, axis)] for name in posterior.noise.names),
+                    [misfit[plant] for misfit in misfits[axis]],
+                    [samples.axes[axis].gaps for samples in posterior.samples],
+                )
+                for axis in axes
+            ]
+            for plant in range(len(values))
         ]
 
     def with_noise(self, values: Vector) -> Vector:

@@ -83,18 +83,17 @@ def posterior_tree(fit: Fit, *, compact: bool = False) -> DataTree:
     by `<record>_drive_time` and `drive`, the axes' names; `record` lists the records.
 
     Of long records, and of all where it shall be `compact`, `log_likelihood` and `posterior_predictive` hold
-    every k-th draw, as their coordinate `draw` says. The priors of single parameters add up to that of all
-    but for a constant, the attribute `joint_support` of `log_prior`: decreasing orders and resolved terms
-    hold a part of the mass. A slash in a name, which netCDF keeps for groups, is written as a vertical bar;
-    names that would be the same get a number (`variable_names`).
+    every k-th draw, as their coordinate `draw` says; a compact tree has no groups of the prior, which depends
+    on the study and its seed alone. The priors of single parameters add up to that of all but for a constant,
+    the attribute `joint_support` of `log_prior`: decreasing orders and resolved terms hold a part of the
+    mass. A slash in a name, which netCDF keeps for groups, is written as a vertical bar; names that would be
+    the same get a number (`variable_names`).
     """
     draws, problem = fit.draws, fit.problem
     posterior, table, study = problem.posterior, draws.table, fit.study
     free = [k for k, row in enumerate(table.rows) if row.free]
     variables = dict(zip(free, variable_names([table.names[k] for k in free]), strict=True))
     rng = np.random.default_rng([study.seed, 3])
-    count = _PRIOR_DRAWS if table.effects is None else _FEWER
-    prior = table.draw(count, np.random.default_rng([study.seed, 9]))
     fitted = _Series.of(posterior.samples)
     shape = draws.values.shape[:2]
     cells = 0 if compact else _CELLS
@@ -102,22 +101,17 @@ def posterior_tree(fit: Fit, *, compact: bool = False) -> DataTree:
     kept = draws.values[:, some]
     flat = kept.reshape(-1, kept.shape[2])
     likelihood, predictive = _predicted(fit, fitted, flat, rng, likelihood=True)
-    _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
     groups: dict[str, dict[str, Any]] = {
         "posterior": {name: draws.values[..., k] for k, name in variables.items()},
         "sample_stats": {"lp": draws.log_density},
-        "log_prior": {
-            name: table.rows[k].log_prior(draws.values[..., k].ravel()).reshape(shape)
-            for k, name in variables.items()
-        },
-        "prior": {name: prior[None, :, k] for k, name in variables.items()},
         "log_likelihood": {name: each.reshape(*kept.shape[:2], -1) for name, each in likelihood.items()},
         "posterior_predictive": {
             name: each.reshape(*kept.shape[:2], -1) for name, each in predictive.items()
         },
-        "prior_predictive": {name: each[None] for name, each in before.items()},
         "observed_data": fitted.observed,
     }
+    if not compact:
+        groups |= _before(fit, fitted, variables)
     series = [fitted]
     drives = _commanded(study.fit)
     groups["constant_data"] = {name: one.drive for name, one in drives.items()}
@@ -140,6 +134,22 @@ def posterior_tree(fit: Fit, *, compact: bool = False) -> DataTree:
         tree[name].coords["draw"] = np.arange(shape[1])[some]
     _describe(tree, fit, variables, series)
     return tree
+
+
+def _before(fit: Fit, fitted: _Series, variables: Mapping[int, str]) -> dict[str, dict[str, Any]]:
+    """The groups of the prior: its draws, what they predict, and its density at the draws of the fit."""
+    draws, table, seed = fit.draws, fit.draws.table, fit.study.seed
+    count = _PRIOR_DRAWS if table.effects is None else _FEWER
+    prior = table.draw(count, np.random.default_rng([seed, 9]))
+    _, predicted = _predicted(fit, fitted, prior, np.random.default_rng([seed, 10]), likelihood=False)
+    return {
+        "log_prior": {
+            name: table.rows[k].log_prior(draws.values[..., k].ravel()).reshape(draws.values.shape[:2])
+            for k, name in variables.items()
+        },
+        "prior": {name: prior[None, :, k] for k, name in variables.items()},
+        "prior_predictive": {name: each[None] for name, each in predicted.items()},
+    }
 
 
 def _step(draws: tuple[int, ...], samples: int, cells: int) -> int:
@@ -166,7 +176,7 @@ def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Se
     """Names, units, records and what the whole rests on, as attributes and coordinates."""
     table, study, grade = fit.draws.table, fit.study, fit.draws.grade
     for k, name in variables.items():
-        for group in ("posterior", "prior"):
+        for group in {"posterior", "prior"} & set(tree.children):
             tree[group][name].attrs |= {"parameter": table.rows[k].name, "units": table.rows[k].unit}
     units = {axis.name: axis.unit for axis in study.response_axes}
     for node in tree.children.values():
@@ -181,7 +191,8 @@ def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Se
     for group, records in (("constant_data", study.fit), ("predictions_constant_data", study.held_out)):
         if group in tree.children:
             tree[group].coords["record"] = [record.name for record in records]
-    tree["log_prior"].attrs["joint_support"] = table.log_support - table.log_permutations
+    if "log_prior" in tree.children:
+        tree["log_prior"].attrs["joint_support"] = table.log_support - table.log_permutations
     tree.attrs |= {
         "study": study.name,
         "version": version("lcopa-bayes"),

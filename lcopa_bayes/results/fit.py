@@ -136,9 +136,10 @@ class Fit(Predictive):
     def save(self, folder: Path | str, *, compact: bool = False, jobs: int = 1, page: bool = False) -> Path:
         """Write draws, numbers and tables into a run folder, which `load_result` reads; returns the folder.
 
-        Where it shall be `compact`, what has one number for each sample is kept for fewer draws. With `page`
-        that is drawn too; draws, tables and page at the same time where there are several `jobs`. InputError
-        naming a file that cannot be written, and as `Result.save`.
+        Where it shall be `compact`, what has one number for each sample is kept for fewer draws, and nothing
+        of the prior (`posterior_tree`). With `page` that is drawn too; draws, tables and page at the same
+        time where there are several `jobs`. InputError naming a file that cannot be written, and as
+        `Result.save`.
         """
         origin = provenance(self.study, self.verb)
         with opened(folder, origin) as path:

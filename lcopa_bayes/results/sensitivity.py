@@ -23,8 +23,9 @@ THRESHOLD = 0.05
 shift of the mean by about a quarter of a standard deviation per doubling of the power."""
 ALPHAS = (0.99, 1.01)
 """Powers at which the posterior is compared with itself [-]."""
-_STRETCHES = 5
-"""Parts of an ensemble that are left out in turn for the Monte Carlo error."""
+_STRETCHES = 10
+"""Parts of all draws, about as many, that are left out in turn for the Monte Carlo error: it is then known to
+a quarter."""
 _FEWEST = 50
 """Draws without which there is no tail to fit."""
 _RANK: dict[Diagnosis, int] = {
@@ -180,11 +181,9 @@ def _scale(values: Array, log_density: Matrix) -> _Scale:
         return _Scale(np.zeros(count), np.zeros(count), np.nan, flat=True)
     weights, k = zip(*(_weights(centred, alpha) for alpha in ALPHAS), strict=True)
     whole = _distances(values, *weights)
-    stretches = [
-        (e, part)
-        for e in range(values.shape[0])
-        for part in np.array_split(np.arange(values.shape[1]), _STRETCHES)
-    ]
+    ensembles, draws = log_density.shape
+    parts = np.array_split(np.arange(draws), -(-_STRETCHES // ensembles))
+    stretches = [(e, part) for e in range(ensembles) for part in parts]
     without = []
     for e, part in stretches:
         keep = np.ones(log_density.shape, dtype=bool)

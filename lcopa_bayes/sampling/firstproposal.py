@@ -125,9 +125,9 @@ def _with_noise(outer: Outer, values: Matrix) -> tuple[Matrix, Matrix]:
     """With noise fitted to each residual, and its widths in the sampled coordinates, (batch, size)."""
     posterior, out = outer.posterior, values.copy()
     widths, problem = np.zeros((len(values), len(outer.columns))), LeastSquares(posterior)
-    for row, one in enumerate(out):
-        full = posterior.complete(posterior.coordinates(one[None]), None)[0]
-        for axis, fit in enumerate(problem.noise_fits(full)):
+    every = posterior.complete(posterior.coordinates(out), None)
+    for row, (one, full, fits) in enumerate(zip(out, every, problem.noise_fits_of(every), strict=True)):
+        for axis, fit in enumerate(fits):
             where = [posterior.table.at(name, axis) for name in posterior.noise.names]
             if not fit.free:
                 continue

@@ -41,9 +41,9 @@ def fit(
     a run folder in which draws are kept while they are made, so that `resume` goes on from them, and the
     result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
     fit the study with integer orders too and compare what both predict of the held-out records; `compact`,
-    keep what has one number for each sample for fewer draws in the folder; `page`, draw the page there too,
-    at the same time as the rest is written; `quiet`, no progress bar, and no first look (`look`) in the
-    folder meanwhile.
+    keep what has one number for each sample for fewer draws in the folder, and no draws of the prior; `page`,
+    draw the page there too, at the same time as the rest is written; `quiet`, no progress bar, and no first
+    look (`look`) in the folder meanwhile.
 
     The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
     written to, holds another study's results, or is being written by another run; then nothing is written.

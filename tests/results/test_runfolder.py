@@ -25,7 +25,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.plot.rundata import load_run
 from lcopa_bayes.report import write_report
 from lcopa_bayes.results import datatree
-from lcopa_bayes.results.datatree import save_tree, variable_names
+from lcopa_bayes.results.datatree import posterior_tree, save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.runfolder import opened
 from lcopa_bayes.results.tables import tables
@@ -172,6 +172,15 @@ def test_long_records_keep_every_kth_draw_of_what_has_a_number_a_sample(fitted, 
     expected = whole["log_likelihood"]["a_y"].sel(draw=where)
     np.testing.assert_array_equal(some["log_likelihood"]["a_y"], expected)
     assert some["posterior"].sizes == whole["posterior"].sizes
+
+
+def test_a_compact_tree_is_the_same_without_the_prior(fitted):
+    whole, compact = fitted.to_datatree(), posterior_tree(fitted, compact=True)
+    assert set(whole.children) - set(compact.children) == {"log_prior", "prior", "prior_predictive"}
+    for group in ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data"):
+        own, every = compact[group].to_dataset(), whole[group].to_dataset()
+        assert own.equals(every.sel(draw=own["draw"]) if "draw" in own.coords else every)
+    assert compact["posterior_predictive"].sizes == compact["log_likelihood"].sizes
 
 
 def test_log_prior_and_log_likelihood_are_consistent_with_the_density(fitted, folder):
