@@ -11,8 +11,8 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-_PORTION = 64
-"""Parameter sets expanded at once."""
+_PORTION, _CELLS = 64, 1 << 16
+"""Parameter sets expanded at once at least, and at most so many times their samples: more leave the cache."""
 
 
 @final
@@ -35,8 +35,9 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
     and Taylor 1989, J. Am. Stat. Assoc. 84); the slope of the normalisation of what is integrated out is
     neglected. Of a plant without effects.
     """
-    if len(values) > _PORTION:
-        portions = np.array_split(values, -(-len(values) // _PORTION))
+    portion = max(_PORTION, _CELLS // max(posterior.size, 1))
+    if len(values) > portion:
+        portions = np.array_split(values, -(-len(values) // portion))
         parts = [expanded(posterior, part, columns) for part in portions]
         return Expansion(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     table, batch, size = posterior.table, len(values), len(columns)

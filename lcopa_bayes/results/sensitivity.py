@@ -28,6 +28,8 @@ _STRETCHES = 10
 a quarter."""
 _FEWEST = 50
 """Draws without which there is no tail to fit."""
+_MOST = 2000
+"""Draws that are scaled: of more every k-th is, for resampled ones say little that others do not."""
 _RANK: dict[Diagnosis, int] = {
     "prior-data conflict": 0,
     "weak likelihood: the prior decides": 0,
@@ -74,10 +76,11 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
     Source: Kallioinen, Paananen, Buerkner and Vehtari 2024, Statistics and Computing 34, 57.
     """
     rows = [(k, row) for k, row in enumerate(posterior.table.rows) if row.free]
-    shape, flat = draws.values.shape[:2], draws.flat
+    values = draws.values[:, :: max(1, round(draws.log_density.size / _MOST))]
+    shape, flat = values.shape[:2], values.reshape(-1, values.shape[2])
     log_prior = np.sum([row.log_density(row.coordinate(flat[:, k])) for k, row in rows], axis=0)
     log_likelihood = posterior.joint_log_likelihood(flat)
-    scaled = [row.coordinate(draws.values[..., k]) for k, row in rows]
+    scaled = [row.coordinate(values[..., k]) for k, row in rows]
     grades = {estimate.name: estimate.grade for estimate in draws.estimates()}
     names = [row.name for _, row in rows]
     return power_scaled(
