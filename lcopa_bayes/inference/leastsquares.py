@@ -169,25 +169,27 @@ class LeastSquares:
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)
         values, source = table.sorted_with_source(raw[None], every=True)
-        jacobian = np.zeros((posterior.size, len(table.rows)))
-        parts, start = [], 0
+        own = source[0][self.columns]  # position among sorted values of each search coordinate
+        rows, prior = self._prior_rows(raw)
+        misfits = np.concatenate([np.empty(posterior.size), prior])
+        jacobian = np.empty((len(own), misfits.size)).T  # a column of a long record is one piece of memory
+        jacobian[posterior.size :] = rows[:, self.columns]
+        start = 0
         blocks = self.plain_slopes(values) if posterior.simulation is None else self._effected(values)
         for axis, observed, block, misfit in blocks:
-            stop = start + observed.values.size
-            stacked = np.concatenate([block.T, misfit[None]])
-            white = self._whiten(stacked, values, axis, observed.gaps)
-            jacobian[start:stop] = white[:-1].T
-            parts.append(white[-1])
-            start = stop
-        jacobian = jacobian[:, source[0]]  # derivatives by sorted position -> by search coordinate
-        for k in self.columns:  # time slopes are in the logarithm already, other log scales are not
-            row = table.rows[k]
+            part = slice(start, start + observed.values.size)
+            start = part.stop
+            stacked = np.concatenate([block.T[own], misfit[None]])
+            *slopes, misfits[part] = self._whiten(stacked, values, axis, observed.gaps)
+            for column, slope in zip(jacobian.T, slopes, strict=True):
+                column[part] = slope
+        for column, k in zip(jacobian[: posterior.size].T, self.columns, strict=True):
+            row = table.rows[k]  # time slopes are in the logarithm already, other log scales are not
             if row.log_scale and row.kind != "time":
-                jacobian[:, k] *= raw[k]
+                column *= raw[k]
             elif row.kind == "time" and not row.log_scale:
-                jacobian[:, k] /= raw[k]
-        rows, prior = self._prior_rows(raw)
-        return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
+                column /= raw[k]
+        return misfits, jacobian
 
     def plain_slopes(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model
@@ -198,7 +200,7 @@ class LeastSquares:
         for r, samples in enumerate(posterior.samples):
             units, unit_slopes = slopes[r]
             for axis, observed in enumerate(samples.axes):
-                block = np.zeros((observed.values.size, len(table.rows)))
+                block = np.zeros((len(table.rows), observed.values.size)).T
                 misfit = -posterior.residual(axis, r, observed, values, units)[0]
                 for k in posterior.acting[axis]:
                     column = posterior.column(k, axis, r, observed, units)
