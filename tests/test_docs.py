@@ -31,7 +31,7 @@ from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.model.effects.catalogue import bundled
 from lcopa_bayes.results import adequacy, discretisation
 from lcopa_bayes.sampling import convergence, evidence
-from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.run import SamplePlan
 
 ROOT = Path(__file__).parents[1]
 FIGURES = {name for name, one in vars(lcopa_bayes.plot).items() if inspect.isfunction(one)}

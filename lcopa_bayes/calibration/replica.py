@@ -32,7 +32,8 @@ from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.steps import StepCurves, curves_of, step_curves
 from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _FINER = 4

@@ -41,7 +41,8 @@ from lcopa_bayes.sampling.crosscheck import CrossCheck
 from lcopa_bayes.sampling.draws import Draws, gather, shortfall
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
-from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.run import Run, SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.weighted import Weighted
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 

@@ -24,7 +24,7 @@ from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import read_json, remove_unfinished, save_json, writable_folder, writing
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.run import SamplePlan
 
 try:
     import fcntl

@@ -16,10 +16,11 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.inference.optimum import Optimum, along_orders
+from lcopa_bayes.inference.optimum import Optimum, along_orders, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
+from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.weighted import Weighted
 
 _PLAN = ImportancePlan(
@@ -36,6 +37,8 @@ _ATTEMPTS, _STRAY = 2, 3
 _SPARSE, _NEGLIGIBLE = 30.0, 0.01
 """Posterior density over that of a proposal from which it does not cover a point, and posterior mass of such
 points that may be missed [-]."""
+_STARTS, _PRIOR = 12, 1_000
+"""Starts of a search for optima, and points of the prior, where nothing else explores it."""
 
 
 def around_optima(
@@ -91,6 +94,29 @@ def around_optima(
         places = zip(posterior.values(z[missed]), density[missed], strict=True)
         optima = [*optima, *(Optimum(at, optima[0].covariance, float(level)) for at, level in places)]
     return False, weighted
+
+
+def without_search(
+    posterior: Posterior,
+    crew: Workers[Posterior],
+    optima: Sequence[Optimum],
+    rng: np.random.Generator,
+    wanted: float,
+    late: Callable[[], bool],
+) -> Weighted | None:
+    """Draws around `optima`, or where there are none those of a search of its own, of a plant whose orders or
+    noise are stated, so that `marginal` has nothing to search; points of the prior show what they miss. None
+    where they will not do."""
+    found = weighty(optima or find_optima(posterior, rng, starts=_STARTS, crew=crew))
+    if not found:
+        return None
+    z = posterior.coordinates(posterior.table.draw(_PRIOR, rng))
+    density = posterior.log_density(z)
+    log_weights = density - posterior.log_prior(z) - np.log(len(z))
+    enough, weighted = around_optima(
+        posterior, crew, crew, found, (z, density, log_weights), rng, wanted, late
+    )
+    return weighted if enough else None
 
 
 def _density(posterior: Posterior, z: Matrix) -> Vector:

@@ -27,7 +27,7 @@ from lcopa_bayes.sampling.convergence import (
     with_shares,
 )
 from lcopa_bayes.sampling.modes import Modes, modes_of
-from lcopa_bayes.sampling.sampler import Run, sampled_qualities
+from lcopa_bayes.sampling.run import Run, sampled_qualities
 from lcopa_bayes.sampling.weighted import Weighted
 
 _MEASURED = 12_000

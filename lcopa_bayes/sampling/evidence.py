@@ -19,7 +19,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Grade, Level
 from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
-from lcopa_bayes.sampling.sampler import Run
+from lcopa_bayes.sampling.run import Run
 
 _RELIABLE = 0.5
 """Largest standard error of a reliable log evidence or log predictive density: a model comparison turns on a

@@ -40,6 +40,12 @@ def applies(posterior: Posterior) -> bool:
     return bool(conditional.given and conditional.elements and conditional.columns)
 
 
+def unsearched(posterior: Posterior) -> bool:
+    """Whether nothing of a plant without effects is searched: its orders and noise are stated, or all of its
+    elements."""
+    return posterior.simulation is None and posterior.dimension > 0 and not applies(posterior)
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Outer:

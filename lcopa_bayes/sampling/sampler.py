@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from math import ceil, inf
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from math import inf
 from pathlib import Path
 from time import monotonic
-from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.core.progress import Progress
-from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.simulation import Simulated
+from lcopa_bayes.sampling.aroundoptima import without_search
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
-from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
 from lcopa_bayes.sampling.ensemble import Birth, Ensemble, Round
 from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.marginal import Search
-from lcopa_bayes.sampling.modes import Modes, modes_of
-from lcopa_bayes.sampling.outer import Outer, applies
+from lcopa_bayes.sampling.outer import Outer, applies, unsearched
 from lcopa_bayes.sampling.proposal import weighty
+from lcopa_bayes.sampling.run import SURPLUS, Run, SamplePlan, filling_modes, finished
 from lcopa_bayes.sampling.separateaxes import Drawn, by_axis
-from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
 """Draws kept per round and walker."""
-_MEMORY = 0.4
-"""Largest memory of a walker at which sampling stops [-]."""
 _SWEEPS = 80
 """Most moves of every walker at each temperature of the tempering path."""
 _LEAST = 5
@@ -43,11 +37,6 @@ _FEWEST = 2
 """Rounds before a budget may end sampling."""
 _AS_LONG = 0.4
 """Least share of the moves of tempering that sampling takes: modes that are hard to reach fill slowly [-]."""
-_TREND = 2.0
-"""Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
-[-]: there chance is the less likely reason, and to go on costs little."""
-_THIN = 5
-"""Steps per kept draw unless the study says otherwise."""
 _MAPPED = 13
 """Most orders, delays and noise parameters that a search is tried on [-]: with more of them, some thousand
 points meet the posterior by chance alone."""
@@ -61,114 +50,6 @@ _AXIS_STEPS = 1_500
 """Most steps of an ensemble of one axis of several: it begins at points of a search, or around optima."""
 _TRAIL = 1_500
 """Draws per ensemble that the first mixture is learned from, where a search gave them."""
-_DELIVERED = 500
-"""Fewest importance draws of a batch that are delivered."""
-_PER_WANTED = 10.0
-"""Delivered draws per effective draw wanted [-] ..."""
-SURPLUS = 1.12
-"""... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
-
-
-@final
-@dataclass(frozen=True)
-class SamplePlan:
-    """How long and how wide to sample."""
-
-    ensembles: int
-    """Independent ensembles [-]."""
-    walkers: int
-    """Walkers per ensemble [-]."""
-    steps: int
-    """Most steps per ensemble [-]."""
-    thin: int
-    """Steps per kept draw [-]."""
-    target_ess: float
-    """Effective sample size that ends sampling [draws]."""
-    seed: int
-    """Root of all randomness of the run."""
-    method: Method = "ensembles"
-    """Importance draws where their weights converge, or ensembles in any case."""
-    seconds: float | None = None
-    """Time after which sampling ends with what it has [s]; None: no limit."""
-
-    @property
-    def delivered(self) -> int:
-        """Resampled importance draws of each batch [-]."""
-        count = max(_DELIVERED, ceil(_PER_WANTED * self.target_ess / BATCHES))
-        return count + -count % CHAIN
-
-    @classmethod
-    def of(
-        cls,
-        dimension: int,
-        *,
-        seed: int,
-        ensembles: int = 4,
-        walkers: int | None = None,
-        steps: int | None = None,
-        thin: int | None = None,
-        target_ess: float = 400,
-        method: Method = "ensembles",
-        seconds: float | None = None,
-    ) -> SamplePlan:
-        """A plan with unset entries chosen from the number of sampled parameters."""
-        least = 2 * dimension + 2
-        return cls(
-            ensembles,
-            max(least + least % 2, walkers or max(128, 16 * dimension)),
-            steps or 2000 + 400 * dimension,
-            thin or _THIN,
-            target_ess,
-            seed,
-            method,
-            seconds,
-        )
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Run:
-    """What sampling gave."""
-
-    ensembles: tuple[Ensemble, ...]
-    plan: SamplePlan
-    weighted: Weighted | None = None
-    """Importance draws, where a proposal gave enough of them."""
-    unconfirmed: tuple[str, ...] = ()
-    """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
-    confirm."""
-    surrogate: Callable[[Matrix], Sequence[Simulated]] | None = None
-    """What stands for the responses of a plant with effects where the draws are; None without."""
-    stopped_after: float | None = None
-    """Time that sampling had taken when its budget ended it [s]; None: it ended by itself."""
-
-    @cached_property
-    def chosen(self) -> Index | None:
-        """Positions of resampled importance draws with equal weights, (batches, draws); None without any."""
-        if self.weighted is None:
-            return None
-        rng = np.random.default_rng(np.random.SeedSequence(self.plan.seed, spawn_key=(1_001,)))
-        return self.weighted.batches(self.plan.delivered, rng)
-
-    @property
-    def visited(self) -> Matrix:
-        """Where the walkers of the ensembles have been in the last three fifths, (points, dimension)."""
-        coordinates = replace(self, weighted=None).kept()[0]
-        return coordinates.reshape(-1, coordinates.shape[-1])
-
-    def kept(self) -> tuple[Array, Array]:
-        """Draws of equal weight: coordinates (ensembles, walkers, draws, dimension), and log density.
-
-        Of importance draws resampled ones, whose batches take the place of ensembles; of ensembles the last
-        three fifths.
-        """
-        if self.weighted is not None and self.chosen is not None:
-            order = self.chosen.reshape(BATCHES, -1, CHAIN)
-            return self.weighted.coordinates[order], self.weighted.log_density[order]
-        chain = np.stack([ensemble.chain for ensemble in self.ensembles])
-        log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
-        first = 2 * chain.shape[1] // 5
-        return chain[:, first:].swapaxes(1, 2), log_density[:, first:].swapaxes(1, 2)
 
 
 def sample(
@@ -188,7 +69,8 @@ def sample(
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
     importance draws around where the walkers have been are tried where a mode filled during them, unless the
     search came nowhere near the posterior. Where it did not, or cannot for the number of parameters that it
-    maps, a limited number of rounds begins with a population tempered from around the optima. Populations
+    maps, a limited number of rounds begins with a population tempered from around the optima. Where orders or
+    noise are stated, so that nothing is searched, importance draws around optima are tried. Populations
     tempered from the prior begin where no search is possible or the plan asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
@@ -255,6 +137,14 @@ def sample(
                     _store(chain_file, Chain((), weighted), fingerprint)
                 return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
+        elif not ensembles and known is None and plan.method == "auto" and unsearched(posterior):
+            with _points(quiet) as bar:
+                bar.set_description("drawing around optima")
+                rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(7_001,)))
+                weighted = without_search(posterior, crew, optima, rng, wanted, lambda: left() <= 0.0)
+            if weighted is not None:
+                _store(chain_file, Chain((), weighted), fingerprint)
+                return Run((), plan, weighted)
         if not ensembles:
             around_optima = tuple(weighty(optima)) if searched and known is None else ()
             begun = "from around the optima" if around_optima else "from the prior"
@@ -286,7 +176,7 @@ def sample(
                 if stopped is not None:
                     return replace(run, stopped_after=stopped)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
-                filling = _filling(posterior, run) if searched and last else ()
+                filling = filling_modes(posterior, run) if searched and last else ()
                 if filling and mapped and (known is not None or not hardest):
                     with _points(quiet) as beside:
                         search = Search(posterior, plan.seed + done, crew, beside)
@@ -319,82 +209,6 @@ def _begun(search: Search, plan: SamplePlan, seeds: Sequence[np.random.SeedSeque
     )
 
 
-def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
-    """Sampled parameters with several modes that drift over the whole run with certainty."""
-    whole = _sampled_values(posterior, run, kept=False)
-    return tuple(
-        modes.parameter
-        for column, modes in enumerate(_sampled_modes(posterior, _sampled_values(posterior, run)))
-        if modes.boundaries
-        and any(abs(apart) > CERTAIN * error for apart, error, _ in drifts(whole[..., column]))
-    )
-
-
 def _store(chain_file: Path | None, chain: Chain, fingerprint: str) -> None:
     if chain_file:
         save_chain(chain_file, chain, fingerprint)
-
-
-def finished(posterior: Posterior, run: Run, bar: Progress | None = None) -> bool:
-    """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
-    shares of its modes have.
-
-    Walkers move a little further than a grade requires, so that the linear parameters, which are drawn
-    afterwards, have too.
-    """
-    values = _sampled_values(posterior, run)
-    qualities = _qualities(posterior, values)
-    if bar is not None:
-        ess, rhat = float(np.min([q.ess for q in qualities])), float(np.max([q.rhat for q in qualities]))
-        memory = float(np.max([q.memory for q in qualities]))
-        acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
-        bar.set_postfix(
-            acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
-        )
-    target = run.plan.target_ess
-    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in qualities)
-    return (
-        good
-        and all(modes.ess >= target for modes in _sampled_modes(posterior, values))
-        and _settled(_sampled_values(posterior, run, kept=False), values)
-    )
-
-
-def _settled(whole: Array, kept: Array) -> bool:
-    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it,
-    values (ensembles, walkers, draws, parameters).
-
-    A mode that few walkers had reached at the start fills slowly and in all ensembles alike, so that neither
-    their agreement nor the effective sample size of the kept draws shows how much is still missing.
-    """
-    for column in range(whole.shape[-1]):
-        pairs = zip(drifts(whole[..., column]), drifts(kept[..., column]), strict=False)
-        for (far, far_error, _), (near, near_error, _) in pairs:
-            if abs(far) > CERTAIN * far_error and abs(near) > _TREND * near_error:
-                return False
-    return True
-
-
-def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
-    """Quality of the sampled parameters over the kept part of a run."""
-    return _qualities(posterior, _sampled_values(posterior, run))
-
-
-def _qualities(posterior: Posterior, values: Array) -> tuple[Quality, ...]:
-    """Quality of values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
-    return qualities([posterior.table.names[k] for k in posterior.sampled], values)
-
-
-def _sampled_modes(posterior: Posterior, values: Array) -> Iterator[Modes]:
-    """Modes of values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
-    for column, k in enumerate(posterior.sampled):
-        row = posterior.table.rows[k]
-        yield modes_of(row.name, row.unit, values[..., column], log_scale=row.log_scale)
-
-
-def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Array:
-    """Values of the sampled parameters that are kept, or all, (ensembles, walkers, draws, parameters)."""
-    chains = [ensemble.chain for ensemble in run.ensembles]
-    coordinates = run.kept()[0] if kept else np.stack(chains).swapaxes(1, 2)
-    values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
-    return values.reshape(*coordinates.shape[:3], -1)

@@ -29,7 +29,7 @@ from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.proposal import weighty
-from lcopa_bayes.sampling.sampler import Run, SamplePlan
+from lcopa_bayes.sampling.run import Run, SamplePlan
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 STARTS, QUICK_STARTS = 4, 2

@@ -39,7 +39,8 @@ from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 
 KINDS = ("fractional-1", "fractional-2", "fractional-3", "first-order", "second-order")
 INTEGER = ("first-order", "second-order")

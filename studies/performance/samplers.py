@@ -42,7 +42,8 @@ from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
-from lcopa_bayes.sampling.sampler import sample, sampled_qualities
+from lcopa_bayes.sampling.run import sampled_qualities
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.unitcube import UnitCube
 
 STUDIES = Path(__file__).parents[1]

@@ -127,7 +127,7 @@ def test_a_look_is_saved_read_back_and_drawn_again(tmp_path, capsys):
 
 
 def test_a_fit_in_a_folder_begins_with_a_look_unless_it_is_quiet(tmp_path, capsys):
-    tiny = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
+    tiny = {"target_ess": 50}
     plain = study(ON, priors=KNOWN, sampler=tiny)
     lb.fit(plain, folder=tmp_path / "loud", quiet=False)
     assert f"first look: {tmp_path / 'loud' / 'look.html'}" in capsys.readouterr().err

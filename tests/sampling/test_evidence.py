@@ -17,7 +17,8 @@ from lcopa_bayes.core.arrays import Array, Matrix
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import Evidence, bridge, evidence
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 
 GAIN = ("gennorm", {"beta": 2.0, "loc": 1.0, "scale": 2.0 * np.sqrt(2)})
 """A normal density under another name, so that the gain is sampled and not integrated out."""

@@ -15,7 +15,8 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import qualities
 from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.evidence import evidence
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 
 FAR = 1.95
 """Distance of Kolmogorov, times the root of the number of draws, exceeded once in a thousand [-]."""

@@ -10,7 +10,8 @@ from small import Toy
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.sampling.knownmodes import around
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 
 WIDE, NARROW = (0.3, 0.08), (0.8, 2e-5)
 """Mean and standard deviation, in each of three coordinates, of a mode and of a needle."""

@@ -20,7 +20,8 @@ from lcopa_bayes.sampling.convergence import qualities
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.mixturemoves import learned
-from lcopa_bayes.sampling.sampler import Run, SamplePlan, finished, sample
+from lcopa_bayes.sampling.run import Run, SamplePlan, _sampled_values, _settled, finished
+from lcopa_bayes.sampling.sampler import sample
 
 ROUND = sampler._ROUND
 POSTERIOR = problem(record(camera=0.6)).posterior
@@ -365,5 +366,5 @@ def test_a_run_is_settled_once_a_mode_no_longer_fills(name):
         ensemble = ensemble_at(toy, chain[-1], child)
         ensembles.append(replace(ensemble, chain=chain, log_density=np.zeros((400, 64))))
     run = Run(tuple(ensembles), plan())
-    whole, kept = (sampler._sampled_values(toy, run, kept=part) for part in (False, True))
-    assert sampler._settled(whole, kept) == settled
+    whole, kept = (_sampled_values(toy, run, kept=part) for part in (False, True))
+    assert _settled(whole, kept) == settled

@@ -19,7 +19,8 @@ from lcopa_bayes.sampling import sampler
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
 from lcopa_bayes.sampling.marginal import Search
-from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.run import Run, SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.separateaxes import separated
 from lcopa_bayes.sampling.weighted import Weighted
 

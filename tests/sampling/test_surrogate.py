@@ -20,7 +20,7 @@ from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling import weightedrun
 from lcopa_bayes.sampling.importance import importance
 from lcopa_bayes.sampling.importanceweights import LARGEST_K, effective
-from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.run import SamplePlan
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted, tail_smoothed
 from lcopa_bayes.sampling.weightedrun import weighted_run
 

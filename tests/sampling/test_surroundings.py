@@ -15,7 +15,8 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling import sampler
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.draws import gather
-from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.run import Run, SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.tempering import surroundings
 
 POSTERIOR = problem(record(camera=0.6)).posterior

@@ -13,7 +13,8 @@ from small import Toy, problem, record
 
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
-from lcopa_bayes.sampling.sampler import SURPLUS, Run, SamplePlan, sample
+from lcopa_bayes.sampling.run import SURPLUS, Run, SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})

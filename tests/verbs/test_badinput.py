@@ -25,7 +25,8 @@ from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling import marginal, sampler
 from lcopa_bayes.sampling.draws import shortfall
-from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.run import SamplePlan
+from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.tempering import temper
 
 PLAN = SamplePlan(2, 12, 200, 1, 100.0, 1)
