@@ -20,6 +20,7 @@ from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.calibration.ranks import LEVELS, rank_of
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.parallel import loss
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.observations import Samples
@@ -231,11 +232,11 @@ class Replication:
             with threadpool_limits(1):
                 return self(number)
         except Exception as error:
-            return self.lost(number, error)
+            return Failure(number, self.seed_of(number), f"{type(error).__name__}: {error}")
 
     def lost(self, number: int, error: BaseException) -> Failure:
-        """A replica that could not be done, and what was raised."""
-        return Failure(number, self.seed_of(number), f"{type(error).__name__}: {error}")
+        """A replica whose worker was lost."""
+        return Failure(number, self.seed_of(number), loss(error))
 
     def __call__(self, number: int) -> Outcome:
         """Draw, simulate, infer, rank."""

@@ -71,6 +71,12 @@ class Workers(Generic[S]):
         return self.each(partial(_alone, function), inputs)
 
 
+def loss(error: BaseException) -> str:
+    """Why a task has no result where its worker was lost, with the first sentence that a library has on it."""
+    said = str(error).partition(". ")[0] or type(error).__name__
+    return f"its worker was lost, perhaps for want of memory ({said})"
+
+
 @final
 class _Later:
     """A task of this process, done when its result is asked for."""

@@ -21,7 +21,7 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import csv_of, read_json, save_json, writable_folder, write_text, write_whole
-from lcopa_bayes.core.parallel import on_cluster, workers
+from lcopa_bayes.core.parallel import loss, on_cluster, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import word_of
 from lcopa_bayes.data.study import Study
@@ -151,9 +151,8 @@ class _Work:
         return plain(outcome)
 
     def lost(self, one: tuple[str, Study], error: BaseException) -> dict[str, Any]:
-        """A device whose worker was lost; of what a library says of it the first sentence."""
-        said = str(error).partition(". ")[0] or type(error).__name__
-        return _failed(one[1].name, one[0], f"its worker was lost, perhaps for want of memory ({said})")
+        """A device whose worker was lost."""
+        return _failed(one[1].name, one[0], loss(error))
 
     def done(self, study: Study) -> dict[str, Any] | None:
         """The stored outcome of a device; None where there is none, or its study has changed: what a device

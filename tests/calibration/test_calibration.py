@@ -304,6 +304,13 @@ def test_priors_stay_the_studys_own(monkeypatch):
     assert plan == replace(made.plan, seed=plan.seed)
 
 
+def test_a_replica_that_was_lost_with_its_worker_says_so():
+    made = replication(STUDY)
+    failure = made.lost(3, RuntimeError("all 4 workers died. Inspect the logs."))
+    assert (failure.replica, failure.seed) == (3, made.seed_of(3))
+    assert failure.error == "its worker was lost, perhaps for want of memory (all 4 workers died)"
+
+
 def test_a_replica_ranks_everything(alone):
     quantities, table = alone.replication.quantities, alone.replication.problem.posterior.table
     names = [quantity.name for quantity in quantities]
