@@ -72,7 +72,7 @@ class Workers(Generic[S]):
 
 
 def loss(error: BaseException) -> str:
-    """Why a task has no result where its worker was lost, with the first sentence that a library has on it."""
+    """Why a task has no result whose worker was lost, with the first sentence that a library has on it."""
     said = str(error).partition(". ")[0] or type(error).__name__
     return f"its worker was lost, perhaps for want of memory ({said})"
 
