@@ -12,7 +12,7 @@ blocks laid over the onset and read by a parabola are off by several percent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, final
 
@@ -92,6 +92,9 @@ class StepResponse:
     """Leading order of each element, (batch,) [-]."""
     leading: int | None = None
     """Row of the derivative in the leading order, if there is one."""
+    readings: dict[tuple[Kind, float, float], Array] = field(default_factory=dict, init=False, repr=False)
+    """What was read of a single plant, by kind, exposure [blocks] and place of the samples in a block: under
+    commands of another height it is the same."""
 
     @cached_property
     def _sums(self) -> Array:

@@ -32,6 +32,8 @@ _TOGETHER = 1 << 17
 """Numbers of a step response times phases or changes that are read at once; more no longer fit the cache."""
 _KEPT = 1 << 16
 """Blocks up to which the spectrum of a phase is kept: those of 24 phases are no more than 25 MB."""
+_HELD = 1 << 20
+"""Numbers read of the step response of a single plant that are kept for other commands: 8 MB."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -243,17 +245,29 @@ class Superposition:
         self, response: StepResponse, origins: Matrix, lattice: Lattice, key: tuple[int, int], kind: Kind
     ) -> list[_Read]:
         """The step response at the place that the samples have in a block, for each of (phases, batch)."""
+        exposed, within = lattice.exposure / lattice.step, origins % 1.0
         places = [
-            (*key, kind, lattice.step, lattice.exposure, round(float(place) / _SAME_PHASE) % _PLACES)
-            for place in origins[:, 0] % 1.0
+            (*key, kind, lattice.step, exposed, round(float(place) / _SAME_PHASE) % _PLACES)
+            for place in within[:, 0]
         ]
-        absent = [k for k, place in enumerate(places) if place not in self.kept and place not in places[:k]]
+        exact = [(kind, exposed, float(place)) for place in within[:, 0]]
+        absent = []
+        for k, place in enumerate(places):
+            if place in self.kept or place in places[:k]:
+                continue
+            if within.shape[1] == 1 and exact[k] in response.readings:
+                self.kept[place] = _Read(origins[k], response.readings[exact[k]])
+            else:
+                absent.append(k)
         together = max(1, _TOGETHER // response.coarse.size)
         for first in range(0, len(absent), together):
             some = absent[first : first + together]
             readings = _readings(response, origins[some], lattice, kind)
             for k, reading in zip(some, readings.swapaxes(0, 1), strict=True):
-                self.kept[places[k]] = _Read.of(origins[k], reading)
+                read = self.kept[places[k]] = _Read.of(origins[k], reading)
+                held = (len(response.readings) + 1) * read.padded.size
+                if within.shape[1] == 1 and held <= _HELD:
+                    response.readings[exact[k]] = read.padded
         return [self.kept[place] for place in places]
 
 

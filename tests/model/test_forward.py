@@ -455,3 +455,35 @@ def test_proportional_drives_are_simulated_once_and_all_the_same():
     assert steps[1].over(steps[0]) == -0.5
     assert other.over(steps[0]) is None
     assert AxisDrive(np.array([0.0, 5.0]), steps[0].values).over(steps[0]) is None
+
+
+# What other commands share
+
+
+@pytest.mark.parametrize("exposure", [0.0, 0.3])
+def test_commands_of_other_heights_and_times_share_what_was_read(exposure):
+    """Responses with the step responses of earlier commands are those without, to rounding."""
+    times = 0.25 * np.arange(1, 81)
+    dynamics = Dynamics((np.array([KELVIN[0]]),), (np.array([KELVIN[1]]),), np.array([[0.4]]))
+    known = {}
+    drives = [
+        AxisDrive(np.array([0.0, 3.1, 9.27]), np.array(heights) * sign)
+        for sign in (1.0, -2.0)
+        for heights in ([1.0, -0.5, 0.25], [2.0, 1.0, -1.0])
+    ]
+    drives.append(AxisDrive(np.array([0.0, 3.100001, 9.27]), np.array([1.0, -0.5, 0.25])))
+    for drive in drives:
+        model = single(drive, times, 2, exposure=exposure)
+        shared = model.unit_responses(dynamics, known)[0]
+        assert_allclose(shared, model.unit_responses(dynamics)[0], rtol=0, atol=1e-14)
+    (response,) = known.values()
+    assert len(response.readings) == 4  # of three changes, and of one that is later by a millionth
+
+
+def test_readings_are_not_kept_of_many_plants():
+    times = 0.25 * np.arange(1, 81)
+    pair = Dynamics((np.array([KELVIN[0]] * 2),), (np.array([KELVIN[1]] * 2),), np.array([[0.4], [0.9]]))
+    model, known = single(UNIT_STEP, times, 2), {}
+    apart = [model.unit_responses(pair[slice(k, k + 1)])[0] for k in range(2)]
+    assert_allclose(model.unit_responses(pair, known)[0], np.concatenate(apart, axis=1), rtol=0, atol=1e-14)
+    assert not any(response.readings for response in known.values())
