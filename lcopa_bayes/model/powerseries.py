@@ -27,7 +27,7 @@ _NUDGE = 1e-4
 
 
 def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
-    """``1 + sum_i (i w T_i)^order_i``, (batch, frequencies), at angular frequencies w (frequencies,).
+    """``1 + sum_i (i w T_i)^order_i``, (batch, frequencies), at angular frequencies w >= 0 (frequencies,).
 
     Parameters: times [time unit] and orders [-], (batch, terms); angular [1 / time unit].
     Its terms have arguments within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal
@@ -35,7 +35,8 @@ def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
     """
     out = np.ones((times.shape[0], angular.size), dtype=np.complex128)
     for time, order in zip(times.T, orders.T, strict=True):
-        out += (1j * angular * time[:, None]) ** order[:, None]
+        turned = np.exp(0.5j * np.pi * order)  # i^order
+        out += turned[:, None] * (angular * time[:, None]) ** order[:, None]
     return out
 
 
