@@ -32,8 +32,8 @@ _TOGETHER = 1 << 17
 """Numbers of a step response times phases or changes that are read at once; more no longer fit the cache."""
 _KEPT = 1 << 16
 """Blocks up to which the spectrum of a phase is kept: those of 24 phases are no more than 25 MB."""
-_HELD = 1 << 20
-"""Numbers read of the step response of a single plant that are kept for other commands: 8 MB."""
+_HELD = 1 << 19
+"""Numbers read of the step response of a single plant that are kept for other commands: 4 MB."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
