@@ -13,6 +13,7 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling import aroundoptima
 from lcopa_bayes.sampling.aroundoptima import without_search
 from lcopa_bayes.sampling.run import Run, SamplePlan
 from lcopa_bayes.sampling.sampler import sample
@@ -71,3 +72,23 @@ def test_an_optimum_that_is_none_misleads_nobody(seed):
         (mean, sd), (expected, spread) = moments(weighted), moments(delivered())
         assert (np.abs(mean - expected) < 5 * spread / np.sqrt(200)).all()
         assert (np.abs(sd / spread - 1.0) < 5 / np.sqrt(2 * 200)).all()
+
+
+def test_points_of_the_prior_weigh_as_much_as_the_posterior(monkeypatch):
+    """The sum of their weights is the evidence: noise above the response lets a thousand points show it."""
+    vague = problem(record(camera=0.6), priors=STATED | {"sigma": 5.0}).posterior
+    seen = []
+    inner = aroundoptima.around_optima
+
+    def noted(*given):
+        seen.append(given[4])
+        return inner(*given)
+
+    monkeypatch.setattr(aroundoptima, "around_optima", noted)
+    weighted = run(vague).weighted
+    assert weighted is not None
+    ((_, _, log_weights),) = seen
+    share = np.exp(log_weights - log_weights.max())
+    error = share.std() / share.mean() / np.sqrt(share.size)
+    assert error < 0.1
+    assert logsumexp(log_weights) == pytest.approx(weighted.log_evidence, abs=4 * error + 0.05)
