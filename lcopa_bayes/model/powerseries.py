@@ -123,12 +123,12 @@ def transfer(times: Array, integrals: Integrals, circle: Circle, *, corrected: b
 
 
 def transfer_slopes(
-    times: Array, integrals: Integrals, circle: Circle, *, in_orders: bool = True, corrected: bool = False
+    times: Array, integrals: Integrals, circle: Circle, *, corrected: bool = False
 ) -> Spectrum:
-    """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
-    order: rows of one array, (1 + terms or 1 + 2 terms, ..., batch, length // 2 + 1)."""
+    """`transfer` and its exact derivatives in every log time constant and, where the integrals have theirs
+    (`in_orders`), every order: rows of one array, (1 + terms or 1 + 2 terms, ..., batch, length // 2 + 1)."""
     top, denominator, parts, scale = _parts(times, integrals, circle, corrected)
-    terms = len(parts)
+    terms, in_orders = len(parts), integrals.in_orders
     out = np.empty((1 + terms * (1 + in_orders), *denominator.shape), dtype=np.complex128)
     inverse = np.divide(1.0, denominator, out=denominator)
     value = np.multiply(top, inverse, out=out[0])

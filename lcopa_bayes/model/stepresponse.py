@@ -264,6 +264,6 @@ def _means(times: Array, integrals: Integrals, circle: Circle, slopes: Slopes) -
     if slopes is None:
         spectra = transfer(times, integrals, circle, corrected=True)[None]
     else:
-        spectra = transfer_slopes(times, integrals, circle, in_orders=slopes == "all", corrected=True)
+        spectra = transfer_slopes(times, integrals, circle, corrected=True)
     spectra *= circle.running  # a unit step from the first block on
     return circle.coefficients(spectra)
