@@ -54,7 +54,7 @@ def folder(fit, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def audit(fit) -> lb.AuditResult:
-    return lb.audit(fit)
+    return lb.audit(fit, quick=True)
 
 
 @pytest.fixture(scope="module")
@@ -208,8 +208,8 @@ def test_a_fit_does_not_depend_on_processes(fit):
 
 def test_an_audit_of_a_fit_a_folder_and_a_study_are_one(fit, folder, audit):
     assert set(audit.summary()["parameter"]) == set(fit.summary()["parameter"])
-    assert lb.audit(folder).to_json() == audit.to_json()
-    assert lb.audit(small()).to_json() == audit.to_json()
+    assert lb.audit(folder, quick=True).to_json() == audit.to_json()
+    assert lb.audit(small(), quick=True).to_json() == audit.to_json()
 
 
 def test_candidates_by_name_and_studies_side_by_side(comparison):
@@ -315,14 +315,14 @@ def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, capsys)
     run = tmp_path / "run"
     lb.load_result(folder).save(run)
     draws = (run / "posterior.nc").read_bytes()
-    assert main(["audit", str(run), "--quiet"]) == 0
+    assert main(["audit", str(run), "--quick", "--quiet"]) == 0
     drawn = (run / "report.html").stat().st_mtime_ns
     assert main(["loop", str(run), "--quick", "--as-stated", "--quiet"]) == 0
     assert (run / "posterior.nc").read_bytes() == draws  # not fitted again
     assert (run / "report.html").stat().st_mtime_ns == drawn  # nor drawn again
     origins = json.loads((run / "provenance.json").read_text())
     assert list(origins) == ["fit", "audit", "loop"]
-    assert origins["audit"]["command"] == ["lcopa-bayes", "audit", str(run), "--quiet"]
+    assert origins["audit"]["command"] == ["lcopa-bayes", "audit", str(run), "--quick", "--quiet"]
     assert origins["loop"]["command"][:2] == ["lcopa-bayes", "loop"]
     assert origins["fit"]["records_sha256"].keys() == {"on"}
     assert lb.load_result(run).verb == "loop"

@@ -42,7 +42,8 @@ _LIKELY = 10.0
 _REACH = 10.0
 """Standard deviations of a delay that are tabulated on either side [-]."""
 _POWERS = (0.05, 0.1, 0.3, 1.0, 1.0)
-"""Of the density, to which each mixture but the first is fitted [-]."""
+"""Of the density, to which each mixture but the first is fitted [-]; the last where the one before is not
+enough."""
 _DRAWN = 2_000
 """Draws of each mixture."""
 _SPARE, _LOOSE = 16, 0.1
@@ -264,12 +265,15 @@ def _weighted(search: LagSearch, proposal: Mixture, rng: np.random.Generator) ->
         log_weights[known] -= (1 - power) * density[known]
         proposal = adapted(np.concatenate(seen.points), log_weights, int(rng.integers(2**31)))
         seen = _joined(seen, search, proposal, rng)
-    log_weights = seen.log_weights()
-    smooth, k = tail_smoothed(log_weights)
-    ess = _DRAWN * seen.efficiency(proposal, log_weights)  # of the last alone, by what all have met
-    if ess < _WANTED or k > usable_k(log_weights.size):
-        return None
-    return np.concatenate(seen.points)[resampled(smooth, _KEPT, rng)], 1 / (1 / ess + 1 / _KEPT)
+        if power < 1:
+            continue
+        log_weights = seen.log_weights()
+        smooth, k = tail_smoothed(log_weights)
+        ess = _DRAWN * seen.efficiency(proposal, log_weights)  # of the last alone, by what all have met
+        if ess >= _WANTED and k <= usable_k(log_weights.size):
+            kept = np.concatenate(seen.points)[resampled(smooth, _KEPT, rng)]
+            return kept, 1 / (1 / ess + 1 / _KEPT)
+    return None
 
 
 def _joined(seen: Seen, search: LagSearch, proposal: Mixture, rng: np.random.Generator) -> Seen:

@@ -193,7 +193,7 @@ def test_the_command_writes_it(run: Path):
     assert len(made.held_out) == 1
 
 
-@pytest.mark.parametrize("support", ["plant", "both", "lags"])
+@pytest.mark.parametrize("support", ["plant", pytest.param("both", marks=pytest.mark.slow), "lags"])
 def test_the_page_says_over_which_plants_its_numbers_are(run: Path, tmp_path: Path, support: str):
     """Gains and delays are over sums of lags too, unless the records do not support these."""
     folder = Path(shutil.copytree(run, tmp_path / "run"))

@@ -29,9 +29,7 @@ gain = { dist = "uniform", loc = 0, scale = 10 }
 [noise]
 kind = "white"
 [sampler]
-ensembles = 2
-walkers = 32
-steps = 200
+target_ess = 100
 """
 VERDICTS = {
     *("identified", "one-sided", "practically unidentifiable", "structurally unidentifiable"),

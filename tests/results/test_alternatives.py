@@ -35,10 +35,14 @@ def short() -> Fit:
 
 
 @pytest.fixture(scope="module")
-def over(short: Fit) -> Alternatives:
-    other = with_alternatives(short, integer_fit(short)).alternatives
-    assert other is not None
-    return other
+def beside(short: Fit) -> Fit:
+    return with_alternatives(short, integer_fit(short))
+
+
+@pytest.fixture(scope="module")
+def over(beside: Fit) -> Alternatives:
+    assert beside.alternatives is not None
+    return beside.alternatives
 
 
 def test_a_plant_that_records_reject_gives_way_to_the_lags(short: Fit, over: Alternatives) -> None:
@@ -82,11 +86,10 @@ def test_the_advantage_is_akaikes_criterion_of_two_least_squares(short: Fit, ove
     assert one.advantage == pytest.approx(expected, rel=0.15)
 
 
-def test_a_better_sum_of_lags_limits_every_number(short: Fit) -> None:
-    fitted = with_alternatives(short, integer_fit(short))
-    assert fitted.draws.grade.level == "tentative"
-    assert "sums of 2 to 3 lags follow y better" in fitted.draws.grade.reason
-    reported = {one.name: one for one in fitted.metrics}["delay[y]"]
+def test_a_better_sum_of_lags_limits_every_number(beside: Fit) -> None:
+    assert beside.draws.grade.level == "tentative"
+    assert "sums of 2 to 3 lags follow y better" in beside.draws.grade.reason
+    reported = {one.name: one for one in beside.metrics}["delay[y]"]
     assert reported.lower <= DELAY <= reported.upper
     assert "of sums of lags" in reported.note
 

@@ -125,6 +125,10 @@ def full(*_, **__):
 
 STUDY = """[records]
 fit = ["a.csv"]
+[model]
+terms = 1
+[noise]
+kind = "white"
 [priors]
 delay = 0.73
 order_1 = 0.8

@@ -47,7 +47,7 @@ def folder(fitted, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_page_drawn_while_the_rest_is_written_is_that_of_the_folder(fitted, tmp_path, jobs):
     fitted.save(tmp_path, jobs=jobs, page=True)
     page = tmp_path / "report.html"
@@ -297,9 +297,7 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
         for name, shift in (("a_b", 0.0), ("a", 0.01))
     ]
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
-    made = fit(
-        study(*both, sampler=TINY | {"steps": 20}, share="all", delay="shared", offset="shared", priors=known)
-    )
+    made = fit(study(*both, sampler=TINY, share="all", delay="shared", offset="shared", priors=known))
     save_tree(made.to_datatree(), tmp_path / "posterior.nc")
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
@@ -323,5 +321,5 @@ def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
         "a", plain.time, plain.drive, np.column_stack([plain.response] * 2), (Axis("u", "V"),), axes, "ms"
     )
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
-    fit(study(two, sampler=TINY | {"steps": 20}, share="all", delay="shared", priors=known)).save(tmp_path)
+    fit(study(two, sampler=TINY, share="all", delay="shared", priors=known)).save(tmp_path)
     assert "gain_front/left_u" in load_run(tmp_path).draws

@@ -149,7 +149,7 @@ def test_no_number_of_limited_draws_is_graded_better():
 
 # -- the whole fit ---------------------------------------------------------------------------------
 
-TINY = {"ensembles": 2, "walkers": 32, "steps": 300, "thin": 3, "target_ess": 100}
+TINY = {"target_ess": 100}
 KNOWN = {"time_1": 1.5, "order_1": 0.8, "offset": 0.3}
 
 

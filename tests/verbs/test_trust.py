@@ -35,7 +35,7 @@ class Mine(ReadoutEffect):
     def seen(self, y, scene, psi):
         return y + psi[0] * y * (y / scene.ranges.response) ** 4
 """
-TINY = {"ensembles": 2, "walkers": 16, "steps": 20, "thin": 1, "target_ess": 100}
+TINY = {"target_ess": 50}
 
 
 @pytest.fixture
