@@ -218,7 +218,8 @@ def divided(shared, one):
 )
 def test_a_verb_gives_the_same_numbers_there(made, verb, monkeypatch):
     """And its tasks are done there: none of a process of this machine."""
-    study = lb.Study("there", fit=[stepped(1), stepped(2)], held_out=[stepped(3)], model={"terms": 1})
+    records = {"fit": [stepped(1), stepped(2)], "held_out": [stepped(3)]}
+    study = lb.Study("there", **records, model={"terms": 1}, noise={"kind": "white"})
     words = {"candidates": ["fractional-1", "first-order"]} if verb == "compare" else {}
     alone = getattr(lb, verb)(study, quick=True, **words)
     monkeypatch.setattr(parallel, "_perform", None)
