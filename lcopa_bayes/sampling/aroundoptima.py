@@ -84,7 +84,8 @@ def around_optima(
             break
         log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
         sparse = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
-        mass = np.where(sparse, np.exp(log_weights - weighted.log_evidence), 0.0)
+        share = np.minimum(log_weights - weighted.log_evidence, 0.0)  # all, where it is more than was found
+        mass = np.where(sparse, np.exp(share), 0.0)
         if mass.sum() < _NEGLIGIBLE:
             return True, weighted
         missed = np.isin(np.arange(mass.size), np.argsort(-mass)[:_STRAY]) & sparse

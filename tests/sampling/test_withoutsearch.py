@@ -59,9 +59,10 @@ def test_moments_and_evidence_are_those_of_a_grid():
     assert weighted.log_evidence == pytest.approx(logsumexp(density) + np.log(cell), abs=0.1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 1, 8])
 def test_an_optimum_that_is_none_misleads_nobody(seed):
-    """From a narrow surrounding of a draw of the prior: what is delivered is the posterior, or nothing."""
+    """From a narrow surrounding of a draw of the prior: what is delivered is the posterior, or nothing. The
+    last seed has points of the prior that are e^709 times as likely as all that was drawn."""
     rng = np.random.default_rng(seed)
     far = POSTERIOR.table.draw(1, rng)
     level = float(POSTERIOR.log_density(POSTERIOR.coordinates(far))[0])
