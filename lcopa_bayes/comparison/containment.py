@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.candidatefit import Contender, criteria, highest
@@ -177,4 +177,4 @@ def share_of(fitted: Fit, starts: Matrix) -> float:
     mass = float(logsumexp(ratio) - np.log(_PROBED))
     if fitted.evidence is None or mass == -np.inf:
         return float(mass > -np.inf)
-    return float(1 / (1 + np.exp(fitted.evidence.value - mass)))
+    return float(expit(mass - fitted.evidence.value))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lcopa_bayes.comparison import candidatefit
 from lcopa_bayes.comparison.candidatefit import Contender, highest
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
 from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.comparison.containment import Check, reached
+from lcopa_bayes.comparison.containment import Check, reached, share_of
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.assembly import problem_of
@@ -213,6 +214,22 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
         assert left["grade_reason"] == "needle"
     resumed = replace(check, card=dict(check.card) | {"containment": reported["containment"]})
     assert resumed()["containment"] == reported["containment"]  # what was checked is not checked again
+
+
+def test_the_share_of_modes_beside_any_evidence():
+    """Of a posterior whose only mode they lie on: a half beside its own evidence, and all or nothing where
+    that of the draws is thousands of nats away."""
+    fitted = fit(study(SHORT, priors=TRUE | {"time_1": ("lognorm", {"s": 0.3, "scale": 1.5})}))
+    own, starts = fitted.evidence, fitted.draws.thinned(64)
+    assert own is not None
+    shares = [
+        share_of(
+            SimpleNamespace(problem=fitted.problem, run=fitted.run, evidence=SimpleNamespace(value=level)),
+            starts,
+        )
+        for level in (own.value - 5_000.0, own.value, own.value + 5_000.0)
+    ]
+    assert shares == [1.0, pytest.approx(0.5, abs=0.02), 0.0]
 
 
 @pytest.fixture(scope="module")
