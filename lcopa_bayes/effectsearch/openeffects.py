@@ -257,7 +257,7 @@ def _elsewhere(state: State, scale: Scale) -> list[Alternative]:
                 there = Regression(tried, whitening).descend(begun, most=_STEPS, gain=_SLIGHT)
             except ArithmeticError:
                 continue
-            weight = float(np.exp(log_bayes_factor(here, there, scale.quiet)))
+            weight = float(np.exp(min(log_bayes_factor(here, there, scale.quiet), _CERTAIN)))
             if weight > LEAST and not any(_same(there, one) for one in known):
                 known.append(there)
                 found = tried.held(there.x)[0].effects[place]

@@ -11,6 +11,7 @@ from test_loop_joint import AXIS
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch import openeffects
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.inference.priors import Prior
@@ -88,3 +89,13 @@ def test_an_instance_that_draws_reach_counts_once(found: Loop):
     assert found.number(0).weights.size == 2
     rows = [replace(row, prior=FLAT) if row.name == "twofold.level" else row for row in table.rows]
     assert other.within(replace(table, rows=tuple(rows)))
+
+
+def test_an_instance_far_likelier_than_the_one_named_takes_all_the_weight(found: Loop, monkeypatch):
+    """And none that is no number: odds of e^5000 are no float."""
+    monkeypatch.setattr(openeffects, "log_bayes_factor", lambda *_: 5_000.0)
+    every = openeffects.alternatives(found.after.state, found.rounds)
+    (other,) = [one for one in every if one.instance]
+    _, weights = openeffects.mixture(found.after.state, None, every)
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights[1 + every.index(other)] == pytest.approx(1.0)
