@@ -27,6 +27,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.forward import Dynamics
 
 _PER_DECADE = 10
 """Tabulated time constants in a decade [-]: between them a response is interpolated to 1e-4."""
@@ -206,18 +207,16 @@ def lag_table(
     log_times = np.linspace(first, last, max(8, round(_PER_DECADE * (last - first) / np.log(10)) + 1))
     offsets = [k for k in posterior.table.of_kind("offset") if posterior.table.rows[k].response == axis]
     offsets = [k for k in offsets if posterior.table.rows[k].free]
-    values = _values(problem, axis, drives, np.exp(log_times), delays)
-    count = len(drives) * len(values)
-    stacked = _columns(problem, axis, drives, values)
-    white = []
+    stacked = _columns(problem, axis, drives, np.exp(log_times), delays)
+    count, white = delays.size * log_times.size, []
+    values = np.array([[0.0 if row.free else row.value for row in posterior.table.rows]])
+    values[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
     for r, (samples, columns) in enumerate(zip(posterior.samples, stacked, strict=True)):
         observed = samples.axes[axis]
         none = np.zeros((0, 1, observed.values.size))  # offsets need no response
         acting = [posterior.column(k, axis, r, observed, none) for k in offsets]
         own = [np.zeros(observed.values.size) if column is None else column[0] for column in acting]
-        held = values[:1].copy()
-        held[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
-        target = posterior.residual(axis, r, observed, held, none)
+        target = posterior.residual(axis, r, observed, values, none)
         own = [*own, *(open_to[r] if open_to else ())]
         whole = np.concatenate([columns, np.reshape(own, (len(own), observed.values.size)), target])
         if observed.values.size:
@@ -239,39 +238,27 @@ def _unit_rows(rows: Matrix) -> Matrix:
     return np.asarray(rows / np.where(lengths == 0.0, 1.0, lengths))
 
 
-def _columns(problem: Problem, axis: int, drives: Sequence[int], values: Matrix) -> list[Matrix]:
-    """Responses to each drive at table values (batch, rows), of every record (drives * batch, samples)
-    [response unit per unit weight]."""
+def _columns(
+    problem: Problem, axis: int, drives: Sequence[int], times: Vector, delays: Matrix
+) -> list[Matrix]:
+    """Responses of one axis to each drive by every tabulated lag, its delay changing fastest, of every record
+    (drives * times * delays, samples) [response unit per unit weight]."""
     posterior, scales = problem.posterior, problem.scales
-    table, units = posterior.table, scales.amplitude[axis] / scales.excursion
-    sizes = [samples.axes[axis].values.size for samples in posterior.samples]
-    out = [np.zeros((len(drives), len(values), size)) for size in sizes]
-    simulated = sum(samples.times.size for samples in posterior.samples) * len(table.layout.units)
-    size = max(1, _VALUES // simulated)
-    for first in range(0, len(values), size):
-        portion = slice(first, first + size)
-        read = posterior.model.unit_responses(table.dynamics(values[portion]))
-        for r, samples in enumerate(posterior.samples):
-            for p, drive in enumerate(drives):
-                gain = table.at("gain", axis, drive)
-                column = posterior.column(gain, axis, r, samples.axes[axis], read[r])
-                if column is not None:
-                    out[r][p, portion] = units[drive] * column
-    return [one.reshape(len(drives) * len(values), -1) for one in out]
-
-
-def _values(problem: Problem, axis: int, drives: Sequence[int], times: Vector, delays: Matrix) -> Matrix:
-    """Table values of every tabulated lag, its delay changing fastest, (times * delays, rows)."""
-    table = problem.posterior.table
-    fixed = np.array([0.0 if row.free else row.value for row in table.rows])
-    values = np.tile(fixed, (times.size * delays.shape[1], 1))
-    for terms in table.terms:
-        values[:, terms.times] = np.repeat(times, delays.shape[1])[:, None]
-        values[:, terms.orders] = 1.0
-    for drive, nodes in zip(drives, delays, strict=True):
-        slot = table.layout.delay_of[axis][drive]
-        values[:, table.at("delay", slot)] = np.tile(nodes, times.size)
-    return values
+    units = scales.amplitude[axis] / scales.excursion
+    seen = [samples.axes[axis] for samples in posterior.samples]
+    batch = times.size * delays.shape[1]
+    out = [np.empty((len(drives), batch, observed.values.size)) for observed in seen]
+    size = max(1, _VALUES // sum(samples.times.size for samples in posterior.samples))
+    lags, orders = np.repeat(times, delays.shape[1])[:, None], np.ones((batch, 1))
+    for drive, nodes, columns in zip(drives, delays, zip(*out, strict=True), strict=True):
+        path = posterior.model.path(axis, drive)
+        every = Dynamics((lags,), (orders,), np.tile(nodes, times.size)[:, None])
+        for first in range(0, batch, size):
+            portion = slice(first, first + size)
+            read = path.unit_responses(every[portion])
+            for own, observed, column, unit in zip(path.experiments, seen, columns, read, strict=True):
+                column[portion] = units[drive] * (own.rest + unit[0][:, observed.chosen])
+    return [one.reshape(len(drives) * batch, -1) for one in out]
 
 
 def _reduced(columns: Matrix, target: Vector) -> tuple[Matrix, Vector]:

@@ -12,6 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
+from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
@@ -97,6 +98,10 @@ class Experiment:
         aligned = tuple(AxisDrive(mesh.lattice.aligned(drive.times), drive.values) for drive in drives)
         return cls(record.name, mesh, aligned, record.drive[0])
 
+    def driven_by(self, drive: int) -> Experiment:
+        """The same record of one of the drives."""
+        return replace(self, drives=(self.drives[drive],), rest=self.rest[[drive]])
+
     @cached_property
     def circle(self) -> Circle:
         """Where this record's series are evaluated."""
@@ -133,6 +138,11 @@ class ForwardModel:
         """The same model of some of the records."""
         own = None if self.effects is None else self.effects.only(records)
         return ForwardModel(self.layout, tuple(self.experiments[r] for r in records), own)
+
+    def path(self, response: int, drive: int) -> ForwardModel:
+        """A plant of one path with one term, from a drive to a response, on the same records."""
+        layout = Layout.of((self.layout.drives[drive],), (self.layout.responses[response],), ModelSettings())
+        return ForwardModel(layout, tuple(experiment.driven_by(drive) for experiment in self.experiments))
 
     def joined(self, other: ForwardModel) -> ForwardModel:
         """The same model of the records of both."""
