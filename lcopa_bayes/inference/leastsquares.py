@@ -187,8 +187,6 @@ class LeastSquares:
             row = table.rows[k]  # time slopes are in the logarithm already, other log scales are not
             if row.log_scale and row.kind != "time":
                 column *= raw[k]
-            elif row.kind == "time" and not row.log_scale:
-                column /= raw[k]
         return misfits, jacobian
 
     def plain_slopes(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
@@ -237,14 +235,14 @@ class LeastSquares:
 
     def _prior_rows(self, raw: Vector) -> tuple[Matrix, Vector]:
         """Standardised normal priors as residual rows."""
-        rows, prior = np.zeros((len(self._normal), raw.size)), np.zeros(len(self._normal))
-        for number, (k, mean, sd) in enumerate(self._normal):
+        rows, prior = np.zeros((len(self.normal), raw.size)), np.zeros(len(self.normal))
+        for number, (k, mean, sd) in enumerate(self.normal):
             rows[number, k] = 1 / sd
             prior[number] = (raw[k] - mean) / sd
         return rows, prior
 
     @cached_property
-    def _normal(self) -> list[tuple[int, float, float]]:
+    def normal(self) -> list[tuple[int, float, float]]:
         """Table position, mean and standard deviation of what has a normal prior in search coordinates."""
         rows = self.posterior.table.rows
         laws = [(k, rows[k].prior) for k in self.columns if not rows[k].log_scale]
@@ -330,13 +328,19 @@ class LeastSquares:
             for plant in range(len(values))
         ]
 
-    def with_noise(self, values: Vector) -> Vector:
-        """The same plant with noise parameters fitted to its residual, where these are free."""
+    def with_noise_of(self, values: Matrix) -> Matrix:
+        """The same plants, (batch, rows), with noise parameters fitted to their residuals, where these are
+        free."""
         table, out = self.posterior.table, values.copy()
-        for axis, fit in enumerate(self.noise_fits(values)):
-            where = [table.at(name, axis) for name in self.posterior.noise.names]
-            out[where] = fit.best(values[where])
+        for plant, fits in zip(out, self.noise_fits_of(values), strict=True):
+            for axis, fit in enumerate(fits):
+                where = [table.at(name, axis) for name in self.posterior.noise.names]
+                plant[where] = fit.best(plant[where])
         return out
+
+    def with_noise(self, values: Vector) -> Vector:
+        """The same of one plant, (rows,)."""
+        return np.asarray(self.with_noise_of(values[None])[0])
 
 
 def apart(

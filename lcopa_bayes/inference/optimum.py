@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import final
+from typing import TypeVar, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import Workers
+from lcopa_bayes.inference.descents import Descents
 from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.pathstarts import beside_each_other
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.spareterms import beside_spare_terms
 from lcopa_bayes.model.effects.effect import UnstableError
 
+T = TypeVar("T")
+R = TypeVar("R")
+_AT_ONCE = 8
+"""Starts of a plant without effects that are descended from together, whatever the number of workers [-]."""
 _SCREENED, _FEWER = 1024, 512
 """Prior draws whose misfit is looked at, and of them beside starts that are known."""
 _FURTHER_STARTS = 2
@@ -46,10 +52,6 @@ _SHORTER, _LEAST_FIRST = 0.25, 0.1
 _SECTION, _WITHIN = (15, 1e-4), 10.0
 """Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
 """
-_CONSTANT, _BARELY = 0.1, 0.02
-"""Order below which a term is nearly a constant, and that of one which is to become one [-]."""
-_BESIDE = (0.9, 0.3)
-"""Order and time of a constant that is to become a term, over those of the term before [-]."""
 
 
 @final
@@ -102,10 +104,11 @@ def find_optima(
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
-    further = _with_spare_terms(posterior, found) if found else []
-    if not further:
-        return found
-    return _recombined(posterior, _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]))
+    spare = beside_spare_terms(posterior, np.stack(weighty)) if (weighty := _weighty(found)) else []
+    if spare:
+        found = _kept(posterior, [*found, *_descended(posterior, spare, crew=crew)])
+        found = _recombined(posterior, found)
+    return _to_its_digits(posterior, found)
 
 
 def _of_several_paths(posterior: Posterior, drawn: Matrix, starts: int) -> Matrix:
@@ -152,9 +155,14 @@ def again(
 ) -> tuple[Optimum, ...]:
     """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
     without those of no weight. `begun` as `LeastSquares`."""
-    best = max(one.log_density for one in optima)
-    near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
-    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew, begun=begun))
+    found = _kept(posterior, _descended(posterior, _weighty(optima), rounds=1, crew=crew, begun=begun))
+    return _to_its_digits(posterior, found) if posterior.simulation is None else found
+
+
+def _weighty(optima: Sequence[Optimum]) -> list[Vector]:
+    """Table values of optima that have a weight beside the best."""
+    best = max((one.log_density for one in optima), default=0.0)
+    return [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
 
 
 def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
@@ -192,43 +200,6 @@ def _held_at(
     reached = held.solve(start, evaluations=_SECTION[0], enough=_SECTION[1])[0]
     there = posterior.table.canonical(problem.with_noise(reached)[None])[0]
     return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
-
-
-def _with_spare_terms(posterior: Posterior, found: Sequence[Optimum]) -> list[Vector]:
-    """Starts in the mode beside that of the best, which a term more than records need makes, unless one of
-    those `found` is in it.
-
-    Of order 0 the last term of an element is a constant: it doubles the gains and stretches the times of the
-    terms before it. Where it is one already, it becomes a term beside the one before.
-    """
-    table, out, best = posterior.table, list[Vector](), found[0].values
-    level = found[0].log_density - _WEIGHTLESS
-    near = np.array([one.values for one in found if one.log_density > level])
-    for times, orders in table.terms:
-        last = orders[-1]
-        constant = near[:, last] < _CONSTANT
-        if constant.any() and not constant.all():
-            continue
-        low, high = table.rows[last].sampled_domain
-        if len(orders) < 2 or table.rows[last].prior is None or not low < _CONSTANT < high:
-            continue
-        if best[last] < _CONSTANT:
-            starts = [best.copy()]
-            starts[0][last] = _BESIDE[0] * best[orders[-2]]
-            starts[0][times[-1]] = _BESIDE[1] * best[times[-2]]
-        else:  # the last term, or the fastest, which slower ones outlive
-            starts = []
-            for omitted in {len(orders) - 1, int(np.argmin(best[times]))}:
-                kept = [k for k in range(len(orders)) if k != omitted]
-                values = best.copy()
-                values[orders[:-1]], values[times[:-1]] = best[orders][kept], best[times][kept]
-                values[last], values[times[-1]] = low + _BARELY, best[times[omitted]]
-                starts.append(values)
-        inside = [
-            np.isfinite(posterior.log_density(posterior.coordinates(one[None]))).all() for one in starts
-        ]
-        out += [one for one, possible in zip(starts, inside, strict=True) if possible]
-    return out
 
 
 def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
@@ -278,16 +249,17 @@ def _descended(
     crew: Workers[Posterior] | None = None,
     begun: bool = False,
 ) -> list[Optimum]:
-    """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
-    response gives none."""
-    descend, problem = partial(_descent, rounds, begun), LeastSquares(posterior)
-    ends = map(partial(descend, posterior), starts) if crew is None else crew.each(descend, starts)
-    reached = sorted((end for end in ends if end is not None), key=lambda end: -end[0])
+    """Optima from table values; a start from which effects leave no bounded response gives none."""
+    problem, reached = LeastSquares(posterior), list[tuple[Vector, Matrix | None]]()
+    if posterior.simulation is None:
+        groups = np.array_split(starts, -(-len(starts) // _AT_ONCE)) if len(starts) else []
+        together = _each(partial(_together, rounds), posterior, groups, crew)
+        reached += [(values, None) for ends in together for values in ends]
+    else:
+        alone = _each(partial(_descent, rounds, begun), posterior, starts, crew)
+        reached += [end for end in alone if end is not None]
     optima = list[Optimum]()
-    for _, values, jacobian in reached:
-        if not optima and posterior.simulation is None:
-            evaluations, enough = _LAST
-            values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
+    for values, jacobian in reached:
         # at the solution itself: its terms may stand in another order than the search left them in, and the
         # noise is that of its own residual
         if jacobian is None:
@@ -296,11 +268,42 @@ def _descended(
     return optima
 
 
+def _to_its_digits(posterior: Posterior, found: tuple[Optimum, ...]) -> tuple[Optimum, ...]:
+    """Optima of a plant without effects, the best of them to its digits."""
+    if not found:
+        return found
+    problem, (evaluations, enough) = LeastSquares(posterior), _LAST
+    values = problem.solve(found[0].values, evaluations=evaluations, enough=enough)[0]
+    values = problem.with_noise(values)
+    _, jacobian = problem.residual(problem.coordinates(values), values)
+    return _kept(posterior, [_describe(posterior, problem, values, jacobian), *found[1:]])
+
+
+def _each(
+    task: Callable[[Posterior, T], R],
+    posterior: Posterior,
+    inputs: Sequence[T],
+    crew: Workers[Posterior] | None,
+) -> Iterator[R]:
+    """Results in the order of the inputs, by the crew where there is one."""
+    return map(partial(task, posterior), inputs) if crew is None else crew.each(task, inputs)
+
+
+def _together(rounds: int, posterior: Posterior, values: Matrix) -> Matrix:
+    """Table values where descents of a plant without effects from others end, (batch, rows)."""
+    problem, descents = LeastSquares(posterior), Descents(posterior)
+    values = posterior.complete(posterior.coordinates(values), None)
+    for steps, enough in _DESCENT[-rounds:]:
+        values = descents.solve(values, steps=steps, enough=enough)
+        values = problem.with_noise_of(posterior.complete(posterior.coordinates(values), None))
+    return values
+
+
 def _descent(
     rounds: int, begun: bool, posterior: Posterior, values: Vector
-) -> tuple[float, Vector, Matrix | None] | None:
-    """Log density [nat] and table values where a descent from others ends, and the slopes that it began with
-    if these hold there; None where there is no bounded response."""
+) -> tuple[Vector, Matrix | None] | None:
+    """Table values where a descent with effects from others ends, and the slopes that it began with if these
+    hold there; None where there is no bounded response."""
     problem = LeastSquares(posterior, begun=begun)
     values = posterior.complete(posterior.coordinates(values[None]), None)[0]
     try:
@@ -311,9 +314,7 @@ def _descent(
     except UnstableError:
         return None
     moved = float(np.linalg.norm(slopes @ (problem.coordinates(values) - start)))
-    hold = begun and posterior.simulation is not None and moved < _BESIDE_START
-    level = float(posterior.log_density(posterior.coordinates(values[None]))[0])
-    return level, values, slopes if hold else None
+    return values, slopes if begun and moved < _BESIDE_START else None
 
 
 def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:
