@@ -8,22 +8,24 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.stats.qmc import Halton
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.inference.descents import Place, descended
 from lcopa_bayes.inference.lagsum import LagTable
 
 MOST = 4
 """Most lags of a path."""
 _APART = 0.7
 """Least distance of the time constants a search starts from [-, natural logarithm]."""
-_STARTS = 3
+_STARTS = 5
 """Places where a further lag is tried."""
 _TRIED, _AGAIN, _LOWER = 1_000, 3, 0.5
 """Places that a path is begun again from, most times that this is done, and least fall of the square
 for which it is done once more [-]."""
+_DESCENT, _GAIN = 40, 1e-3
+"""Most steps of a descent [-], and gain below which it ends [nat]."""
 _STEP = 1e-7
 """Step of a difference quotient, over the range of its coordinate [-]."""
 
@@ -36,7 +38,8 @@ class LagFit:
     lags: int
     coordinates: Vector
     """Log times path by path, then delays, (dimension,)."""
-    jacobian: Matrix
+    information: Matrix
+    """Of the coordinates, (dimension, dimension)."""
     square: float
     """Whitened residual and weights, squared [-]."""
     size: int
@@ -55,7 +58,46 @@ class LagFit:
     @cached_property
     def covariance(self) -> Matrix:
         """Of the coordinates near the optimum, (dimension, dimension)."""
-        return covariance_of(self.jacobian.T @ self.jacobian)
+        return np.asarray(covariance_of(self.information))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LagDescents:
+    """Descents of sums of lags, weights eliminated. Points are coordinates, (batch, dimension)."""
+
+    table: LagTable
+    moving: Index
+    """Coordinates that change."""
+
+    def at(self, points: Matrix) -> Place:
+        """What a descent knows at points, by differences."""
+        low, high = self.room(points)
+        width = _STEP * (high - low)
+        own = np.where(width > high, -width, width)
+        shifted = np.repeat(points[:, None], 1 + self.moving.size, axis=1)
+        shifted[:, 1 + np.arange(self.moving.size), self.moving] += own
+        values = self.table.residuals(shifted.reshape(-1, points.shape[1]))
+        values = values.reshape(*shifted.shape[:2], -1)
+        residual, slopes = values[:, 0], (values[:, 1:] - values[:, :1]) / own[..., None]
+        return Place(
+            points,
+            -0.5 * (residual**2).sum(axis=1),
+            -(slopes @ residual[..., None])[..., 0],
+            slopes @ slopes.swapaxes(1, 2),
+        )
+
+    def room(self, points: Matrix) -> tuple[Matrix, Matrix]:
+        """Steps to the ends of the table, (batch, moving)."""
+        paths = self.table.paths
+        low, high = self.table.ends((points.shape[1] - paths) // paths)
+        return (low - points)[:, self.moving], (high - points)[:, self.moving]
+
+    def moved(self, points: Matrix, steps: Matrix) -> Matrix:
+        """Coordinates so many steps on."""
+        out = points.copy()
+        out[:, self.moving] += steps
+        return out
 
 
 def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
@@ -64,15 +106,23 @@ def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
     everywhere."""
     fits: list[LagFit] = []
     for lags in range(1, MOST + 1):
-        tried = [_descended(table, lags, start) for start in _starts(table, fits[-1] if fits else None)]
-        best = min(tried, key=lambda one: one.square)
+        best = _best_from(table, lags, _starts(table, fits[-1] if fits else None))
         for _ in range(_AGAIN):
-            again = _descended(table, lags, _exchanged(table, best.coordinates))
+            again = _best_from(table, lags, _exchanged(table, best.coordinates)[None])
             if again.square > best.square - _LOWER:
                 break
             best = again
         fits.append(best)
     return tuple(fits)
+
+
+def _best_from(table: LagTable, lags: int, starts: Matrix) -> LagFit:
+    """The best of descents from starts, (batch, dimension)."""
+    every = LagDescents(table, np.arange(starts.shape[1]))
+    ends = descended(every, np.clip(starts, *table.ends(lags)), steps=_DESCENT, least=_GAIN)
+    best = int(ends.level.argmax())
+    square = table.remainder - 2 * float(ends.level[best])
+    return LagFit(lags, ends.points[best], ends.information[best], square, table.size)
 
 
 def _exchanged(table: LagTable, coordinates: Vector) -> Vector:
@@ -94,16 +144,18 @@ def best_of(fits: Sequence[LagFit]) -> LagFit:
     return min(fits, key=lambda one: one.bic)
 
 
-def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
+def _starts(table: LagTable, fewer: LagFit | None) -> Matrix:
     nodes = table.log_times[table.log_times >= table.shortest][2:-2]
     if fewer is None:
         low, high = table.delays[:, 0], table.delays[:, -1]
         places = np.quantile(nodes, (0.25, 0.5, 0.75))
-        return [
-            np.concatenate([np.full(table.paths, place), low + share * (high - low)])
-            for place in places
-            for share in (0.1, 0.5, 0.9)
-        ]
+        return np.array(
+            [
+                np.concatenate([np.full(table.paths, place), low + share * (high - low)])
+                for place in places
+                for share in (0.1, 0.5, 0.9)
+            ]
+        )
     log_times, delays = table.parts(fewer.coordinates[None])
     further = np.broadcast_to(nodes[:, None, None], (nodes.size, table.paths, 1))
     every = np.concatenate([np.repeat(log_times, nodes.size, axis=0), further], axis=2)
@@ -113,28 +165,4 @@ def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
     for k in np.argsort(-table.conditional(starts).log_marginal):
         if all(abs(nodes[k] - nodes[other]) > _APART for other in chosen):
             chosen.append(int(k))
-    return list(starts[chosen[:_STARTS]])
-
-
-def _descended(table: LagTable, lags: int, start: Vector) -> LagFit:
-    low, high = table.ends(lags)
-    steps = _STEP * (high - low)
-
-    def residual(x: Vector) -> Vector:
-        return np.asarray(table.residuals(x[None])[0])
-
-    def slopes(x: Vector) -> Matrix:
-        own = np.where(x + steps > high, -steps, steps)
-        values = table.residuals(np.concatenate([x[None], x + np.diag(own)]))
-        return np.asarray((values[1:] - values[0]).T / own)
-
-    optimum = least_squares(
-        residual,
-        np.clip(start, low, high),
-        slopes,
-        bounds=(low, high),
-        x_scale=high - low,
-        max_nfev=40,
-    )
-    square = 2 * float(optimum.cost) + table.remainder
-    return LagFit(lags, optimum.x, np.asarray(optimum.jac), square, table.size)
+    return starts[chosen[:_STARTS]]

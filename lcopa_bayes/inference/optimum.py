@@ -12,11 +12,11 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.inference.descents import Descents
 from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.pathstarts import beside_each_other
+from lcopa_bayes.inference.plantdescents import PlantDescents
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.spareterms import beside_spare_terms
@@ -291,7 +291,7 @@ def _each(
 
 def _together(rounds: int, posterior: Posterior, values: Matrix) -> Matrix:
     """Table values where descents of a plant without effects from others end, (batch, rows)."""
-    problem, descents = LeastSquares(posterior), Descents(posterior)
+    problem, descents = LeastSquares(posterior), PlantDescents(posterior)
     values = posterior.complete(posterior.coordinates(values), None)
     for steps, enough in _DESCENT[-rounds:]:
         values = descents.solve(values, steps=steps, enough=enough)

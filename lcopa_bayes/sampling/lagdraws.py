@@ -22,11 +22,14 @@ from typing import Any, final
 import emcee
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+from scipy.stats.qmc import Halton
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.descents import descended
 from lcopa_bayes.inference.diffusion import KINDS, Kind, diffused, rises
-from lcopa_bayes.inference.lagfits import MOST, LagFit, best_of, lag_fits
+from lcopa_bayes.inference.lagfits import MOST, LagDescents, LagFit, best_of, lag_fits
 from lcopa_bayes.inference.lagsum import LagTable, lag_table
 from lcopa_bayes.sampling.importanceweights import usable_k
 from lcopa_bayes.sampling.mixture import Mixture
@@ -46,12 +49,17 @@ _POWERS = (0.05, 0.1, 0.3, 1.0, 1.0)
 enough."""
 _DRAWN = 2_000
 """Draws of each mixture."""
-_SPARE, _LOOSE = 16, 0.1
-"""Components of the first mixture with a spare lag anywhere, and the largest standard deviation of the first
-components, over the range of a coordinate [-]."""
-_WALKERS, _STEPS, _THIN = 96, 500, 10
-_ROUNDS = 8
-"""Most times that many steps are made; the first two are left out."""
+_SPARE, _LOOSE = 32, 0.1
+"""Components of the first mixture with a spare lag anywhere, for each path, and the largest standard
+deviation of its components, over the range of a coordinate [-]."""
+_SETTLED, _GAIN = 8, 0.1
+"""Most steps of everything else with such a lag in its place [-], and gain below which they end [nat]."""
+_WEIGHTLESS, _LIGHT = 15.0, 3.0
+"""Gaussian mass of components, below that of the heaviest, from which they are left out, and to which they
+count by it [nat]."""
+_WALKERS, _STEPS, _THIN = 96, 300, 10
+_ROUNDS = 13
+"""Most times that many steps are made; the first are left out."""
 _MOVED = 3
 """Coordinates of a walker that a proposal moves [-]."""
 _WANTED = 200.0
@@ -296,7 +304,7 @@ def _walked(
     position = np.where(inside, position, rng.uniform(low, high, position.shape))
     sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=_FewMove())
     state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
-    state = sampler.run_mcmc(state, 2 * _STEPS, skip_initial_state_check=True)
+    state = sampler.run_mcmc(state, _STEPS, skip_initial_state_check=True)
     sampler.reset()
     for _ in range(_ROUNDS):
         state = sampler.run_mcmc(state, _STEPS)
@@ -332,34 +340,56 @@ def _ess(table: LagTable, chain: Array) -> float:
 
 
 def _begun(search: LagSearch, lags: int, rng: np.random.Generator) -> Mixture:
-    """Components near the optimum of so many lags, and, where the best has fewer, near that of one lag fewer
-    with a spare one anywhere."""
-    table = search.table
+    """Components near the optimum of so many lags, and, where the best has fewer, near those of everything
+    else with a spare lag in many places; by their Gaussian mass, in which none is nearly nothing."""
+    table, first = search.table, search.fits[lags - 1]
     low, high = table.ends(lags)
     widest = _LOOSE * (high - low)
-    centres, covariances = [search.fits[lags - 1].coordinates], [search.fits[lags - 1].covariance]
+    centres, covariances = first.coordinates[None], _narrowed(first.covariance, widest)[None]
     if lags > search.best.lags:
-        fewer = search.fits[lags - 2]
-        spare = np.arange(table.paths) * lags + fewer.lags
-        own = np.setdiff1d(np.arange(low.size), spare)
-        for _ in range(_SPARE):
-            centre, covariance = np.empty(low.size), np.diag(widest**2)
-            centre[own], centre[spare] = fewer.coordinates, rng.uniform(low[spare], high[spare])
-            covariance[np.ix_(own, own)] = fewer.covariance
-            centres.append(centre)
-            covariances.append(covariance)
+        spared = _spared(search, lags, widest, rng)
+        centres, covariances = (
+            np.concatenate(each) for each in zip(spared, (centres, covariances), strict=True)
+        )
+    mass = table.conditional(centres).log_marginal + 0.5 * np.linalg.slogdet(covariances)[1]
+    mass -= mass.max()
+    counts = np.flatnonzero(mass > -_WEIGHTLESS)
+    weights = np.exp(np.maximum(mass[counts], -_LIGHT))
     means, factors = [], []
-    for centre, covariance in zip(centres, covariances, strict=True):
+    for centre, covariance in zip(centres[counts], covariances[counts], strict=True):
         log_times, delays = table.parts(np.arange(float(low.size))[None])
         times = np.array(table.parts(centre[None])[0])
         times[..., : search.apart] = -np.inf  # stays first
         ranks = np.argsort(times, axis=2)
         order = np.append(np.take_along_axis(log_times, ranks, axis=2).ravel(), delays).astype(int)
-        shrunk = np.minimum(1.0, widest / np.maximum(np.sqrt(np.diag(covariance)), 1e-300))
-        covariance = covariance * np.outer(shrunk, shrunk) + np.diag((1e-2 * widest) ** 2)
         means.append(centre[order])
         factors.append(np.linalg.cholesky(covariance[np.ix_(order, order)]))
-    return Mixture(np.full(len(means), 1 / len(means)), np.array(means), np.array(factors))
+    return Mixture(weights / weights.sum(), np.array(means), np.array(factors))
+
+
+def _spared(search: LagSearch, lags: int, widest: Vector, rng: np.random.Generator) -> tuple[Matrix, Array]:
+    """Optima of everything else with a lag more than the best has in many places, (places, dimension), and
+    their covariances."""
+    table, fewer = search.table, search.fits[lags - 2]
+    low, high = table.ends(lags)
+    spare = np.arange(table.paths) * lags + fewer.lags
+    own = np.setdiff1d(np.arange(low.size), spare)
+    points = np.empty((_SPARE * table.paths, low.size))
+    points[:, own] = fewer.coordinates
+    places = Halton(table.paths, rng=rng).random(len(points))
+    points[:, spare] = low[spare] + (high - low)[spare] * places
+    ends = descended(LagDescents(table, own), points, steps=_SETTLED, least=_GAIN)
+    covariances = np.tile(np.diag(widest**2), (len(points), 1, 1))
+    for covariance, information in zip(covariances, ends.information, strict=True):
+        covariance[np.ix_(own, own)] = _narrowed(covariance_of(information), widest[own])
+    return ends.points, covariances
+
+
+def _narrowed(covariance: Matrix, widest: Vector) -> Matrix:
+    """A covariance with no larger standard deviation than the `widest`, nor one of nothing."""
+    sd = np.sqrt(np.diag(covariance))
+    shrunk = np.minimum(1.0, widest / np.maximum(sd, 1e-300))
+    return np.asarray(covariance * np.outer(shrunk, shrunk) + np.diag((1e-2 * widest) ** 2))
 
 
 def _nodes(ends: Matrix, count: int) -> Matrix:

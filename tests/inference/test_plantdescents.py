@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 from small import TWO, problem, record
 
-from lcopa_bayes.inference import descents
-from lcopa_bayes.inference.descents import Descents
+from lcopa_bayes.inference import plantdescents
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import nearly_white
+from lcopa_bayes.inference.plantdescents import PlantDescents
 from lcopa_bayes.inference.posterior import Posterior
 
 SHORT = record(camera=0.6)
@@ -51,7 +51,7 @@ def test_descents_end_where_those_of_scipy_do(name):
     posterior = small(name)
     begun = starts(posterior, 5)
     alone = [LeastSquares(posterior).solve(one, evaluations=400, enough=1e-12)[0] for one in begun]
-    together = Descents(posterior).solve(begun, steps=200, enough=1e-6)
+    together = PlantDescents(posterior).solve(begun, steps=200, enough=1e-6)
     least = squares(posterior, np.array(alone)).min()
     reached = squares(posterior, together)
     # the normalisation of what is eliminated counts too, and moves the optimum by a fraction of a nat
@@ -64,7 +64,7 @@ def test_descents_end_where_those_of_scipy_do(name):
 
 def test_student_noise_ends_at_its_likeliest_plant():
     posterior = problem(SHORT, noise="student", priors={"sigma": 0.05, "nu": 4.0}).posterior
-    reached = Descents(posterior).solve(starts(posterior, 3), steps=200, enough=1e-7)
+    reached = PlantDescents(posterior).solve(starts(posterior, 3), steps=200, enough=1e-7)
     best = reached[posterior.log_likelihood(reached).argmax()]
     level = posterior.log_likelihood(best[None])[0]
     for k in posterior.sampled:
@@ -77,9 +77,9 @@ def test_student_noise_ends_at_its_likeliest_plant():
 def test_a_start_ends_in_a_batch_where_it_ends_alone():
     posterior = problem(record(device=TWO, camera=0.5), share="all", terms=2).posterior
     begun = nearly_white(posterior, starts(posterior, 4))
-    together = Descents(posterior).solve(begun, steps=3, enough=1e-3)
+    together = PlantDescents(posterior).solve(begun, steps=3, enough=1e-3)
     for one, end in zip(begun, together, strict=True):
-        assert_allclose(Descents(posterior).solve(one[None], steps=3, enough=1e-3)[0], end, rtol=1e-6)
+        assert_allclose(PlantDescents(posterior).solve(one[None], steps=3, enough=1e-3)[0], end, rtol=1e-6)
 
 
 def test_values_stay_inside_the_support():
@@ -89,7 +89,7 @@ def test_values_stay_inside_the_support():
         **NOISE,
     }
     posterior = problem(SHORT, priors=priors).posterior
-    reached = Descents(posterior).solve(starts(posterior, 3), steps=50, enough=1e-6)
+    reached = PlantDescents(posterior).solve(starts(posterior, 3), steps=50, enough=1e-6)
     assert np.isfinite(posterior.log_prior(posterior.coordinates(reached))).all()
     # the device is later and larger than these allow
     delay, gain = (posterior.table.of_kind(kind)[0] for kind in ("delay", "gain"))
@@ -99,13 +99,15 @@ def test_values_stay_inside_the_support():
 
 def test_a_start_that_cannot_come_near_the_best_costs_little(monkeypatch):
     """The others end where they end alone, and that one stays as far below."""
-    posterior, sizes, whole = small("one path"), [], descents.expanded
-    monkeypatch.setattr(descents, "expanded", lambda of, at, k: sizes.append(len(at)) or whole(of, at, k))
+    posterior, sizes, whole = small("one path"), [], plantdescents.expanded
+    monkeypatch.setattr(
+        plantdescents, "expanded", lambda of, at, k: sizes.append(len(at)) or whole(of, at, k)
+    )
     drawn = posterior.table.draw(40, np.random.default_rng(3))
     begun = posterior.complete(posterior.coordinates(drawn), None)
-    together = Descents(posterior).solve(begun, steps=40, enough=1e-5)
+    together = PlantDescents(posterior).solve(begun, steps=40, enough=1e-5)
     used = sum(sizes)
-    alone = np.array([Descents(posterior).solve(one[None], steps=40, enough=1e-5)[0] for one in begun])
+    alone = np.array([PlantDescents(posterior).solve(one[None], steps=40, enough=1e-5)[0] for one in begun])
     level, own = posterior.log_likelihood(together), posterior.log_likelihood(alone)
     near = own > own.max() - 50.0
     assert 3 < near.sum() < 37
