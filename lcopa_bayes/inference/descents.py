@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 
 _DAMPING = (1e-2, 1e-9, 1e6)
 """Damping at the start, least and most, relative to the curvature [-]."""
@@ -59,39 +59,51 @@ def descended(landscape: Landscape, points: Matrix, *, steps: int, least: float)
     moving = np.arange(len(points))
     for remaining in range(steps, 0, -1):
         here = Place(*(part[moving] for part in at))
-        step = _step(here, damping[moving], *landscape.room(here.points))
+        step, unbound, clipped = _step(here, damping[moving], *landscape.room(here.points))
         bent = (here.information @ step[..., None])[..., 0]
         promised = (step * (here.gradient - 0.5 * bent)).sum(axis=1)
-        likely = np.minimum(promised, gained[moving])
+        likely = np.minimum(unbound, gained[moving])
         hopeless = here.level + _FASTER * remaining * likely + _HOPELESS < at.level.max()
-        going = ~hopeless & ((promised >= least) | (damping[moving] > _FREE)) & (gained[moving] >= least)
-        moving, promised = moving[going], promised[going]
+        going = ~hopeless & ((unbound >= least) | (damping[moving] > _FREE)) & (gained[moving] >= least)
+        moving, promised, clipped = moving[going], promised[going], clipped[going]
         if not moving.size:
             break
         new = landscape.at(landscape.moved(here.points[going], step[going]))
         gain = new.level - at.level[moving]
-        better, agreeing = gain > 0.0, gain > _AGREEING * promised
+        better = gain > 0.0
+        agreeing = better & (gain > _AGREEING * promised)
         for old, now in zip(at, new, strict=True):
             old[moving[better]] = now[better]
-        gained[moving[agreeing]] = gain[agreeing]
-        change = np.select([gain > _CLOSE * promised, agreeing], [_LESS, 1.0], _MORE)
+        gained[moving[agreeing]] = np.where(clipped, np.inf, gain)[agreeing]
+        change = np.select([agreeing & (gain > _CLOSE * promised), agreeing], [_LESS, 1.0], _MORE)
         damping[moving] = np.clip(change * damping[moving], *_DAMPING[1:])
     return at
 
 
-def _step(here: Place, damping: Vector, low: Matrix, high: Matrix) -> Matrix:
-    """Damped steps, (batch, size), from `low` to `high`; what would leave these ends there, and the others
-    follow."""
+def _step(here: Place, damping: Vector, low: Matrix, high: Matrix) -> tuple[Matrix, Vector, Flags]:
+    """Damped steps, (batch, size), from `low` to `high`; the gain that slopes promise to what no end holds
+    back, (batch,) [nat]; and whether the step had to be cut, (batch,).
+
+    What an end holds against its slope stays there (Bertsekas 1982, SIAM J. Control Optim. 20); what would
+    leave the ends stops there, and the others follow.
+    """
     scale = np.sqrt(np.maximum(np.diagonal(here.information, axis1=1, axis2=2), 1e-300))
     curved = here.information / scale[:, :, None] / scale[:, None, :]
     curved += damping[:, None, None] * np.eye(scale.shape[1])
     slope = here.gradient / scale
-    step = np.linalg.solve(curved, slope[..., None])[..., 0] / scale
-    held = (step < low) | (step > high)
-    if held.any():
-        ends = np.where(held, np.clip(step, low, high), 0.0)
-        slope = np.where(held, 0.0, slope - (curved @ (ends * scale)[..., None])[..., 0])
-        free = ~held
-        curved = curved * (free[:, :, None] & free[:, None, :]) + np.eye(scale.shape[1]) * held[:, :, None]
-        step = np.where(held, ends, np.linalg.solve(curved, slope[..., None])[..., 0] / scale)
-    return np.clip(step, low, high)
+    still = ((low >= 0.0) & (slope < 0.0)) | ((high <= 0.0) & (slope > 0.0))
+    step = _solved(curved, slope, still, np.zeros(slope.shape)) / scale
+    promised = 0.5 * (step * here.gradient).sum(axis=1)
+    leaving = (step < low) | (step > high)
+    if leaving.any():
+        ends = np.where(leaving, np.clip(step, low, high), 0.0)
+        step = np.clip(_solved(curved, slope, still | leaving, ends * scale) / scale, low, high)
+    return step, promised, np.asarray(leaving.any(axis=1))
+
+
+def _solved(matrix: Array, right: Matrix, held: Flags, values: Matrix) -> Matrix:
+    """Solutions of linear systems with the values of some of their unknowns held, (batch, size)."""
+    free = ~held
+    right = np.where(held, values, right - (matrix @ np.where(held, values, 0.0)[..., None])[..., 0])
+    kept = matrix * (free[:, :, None] & free[:, None, :]) + np.eye(right.shape[1]) * held[:, :, None]
+    return np.asarray(np.linalg.solve(kept, right[..., None])[..., 0])

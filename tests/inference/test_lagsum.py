@@ -10,11 +10,12 @@ import pytest
 from small import U, Y
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.lagfits import lag_fits
+from lcopa_bayes.inference.descents import descended
+from lcopa_bayes.inference.lagfits import LagDescents, lag_fits
 from lcopa_bayes.inference.lagsum import WEIGHT, LagTable, lag_problem, lag_table
 
 SD = 0.01
@@ -169,10 +170,13 @@ def two_drives(seed: int, paths: tuple[tuple[tuple[float, float], float], ...]) 
     return Study("both", None, "s", 0, tuple(records), (), noise={"kind": "white"})
 
 
+PATHS = (((3.2, 0.92), 2.85), ((10.5, 4.1), 1.27))
+
+
 @pytest.mark.parametrize(
     ("seed", "paths"),
     [
-        (1, (((3.2, 0.92), 2.85), ((10.5, 4.1), 1.27))),
+        (1, PATHS),
         (9, (((8.4, 4.7), 2.33), ((1.74, 1.1), 2.75))),
         (14, (((7.6, 4.7), 2.58), ((2.13, 1.24), 1.65))),
     ],
@@ -186,6 +190,43 @@ def test_least_squares_of_two_paths_leave_no_more_than_what_made_the_records(
     truth = np.array([*np.log(first), *np.log(second), early, late])
     square = float((table.residuals(truth[None]) ** 2).sum()) + table.remainder
     assert lag_fits(table)[1].square <= square + 0.1
+
+
+def test_slopes_of_a_descent_are_those_of_its_level() -> None:
+    delays = np.linspace([0.0, 0.0], [6.0, 6.0], 33).T
+    table = lag_table(lag_problem(two_drives(1, PATHS)), 0, [0, 1], np.array([2 * SD]), delays)
+    moving = np.array([0, 2, 4])
+    landscape = LagDescents(table, moving)
+    point = np.array([[1.1, 0.2, 2.1, 1.3, 2.7, 1.4]])
+    at = landscape.at(point)
+    assert at.level == pytest.approx(-0.5 * (table.residuals(point) ** 2).sum(axis=1))
+    for position, k in enumerate(moving):
+        step = np.zeros(point.shape)
+        step[0, k] = 1e-4
+        up, down = (landscape.at(point + sign * step).level[0] for sign in (1, -1))
+        assert at.gradient[0, position] == pytest.approx((up - down) / 2e-4, rel=1e-4)
+    ends = descended(landscape, point, steps=20, least=1e-6)
+    still = np.setdiff1d(np.arange(6), moving)
+    assert (ends.points[:, still] == point[:, still]).all()
+    assert ends.level > at.level + 1
+
+
+def test_a_table_of_one_response_is_that_of_a_study_without_the_others() -> None:
+    alone = two_drives(1, PATHS)
+    other = Axis("z", "rad")
+    fit = tuple(
+        replace(
+            one,
+            response=np.concatenate([0.1 * one.drive[:, :1], one.response], axis=1),
+            response_axes=(other, *one.response_axes),
+        )
+        for one in alone.fit
+    )
+    delays, noise = np.linspace([0.0, 1.0], [3.0, 6.0], 9).T, np.array([2 * SD])
+    single = lag_table(lag_problem(alone), 0, [0, 1], noise, delays)
+    both = lag_table(lag_problem(replace(alone, fit=fit)), 1, [0, 1], noise, delays)
+    places = np.random.default_rng(0).uniform(*single.ends(2), (20, 6))
+    assert both.log_density(places) == pytest.approx(single.log_density(places), abs=1e-6)
 
 
 def test_samples_may_lie_anywhere_along_what_they_are_open_to() -> None:
