@@ -71,10 +71,9 @@ class LagDescents:
     """Coordinates that change."""
 
     def at(self, points: Matrix) -> Place:
-        """What a descent knows at points, by differences."""
+        """What a descent knows at points, by differences; what is tabulated goes on beyond its ends."""
         low, high = self.room(points)
-        width = _STEP * (high - low)
-        own = np.where(width > high, -width, width)
+        own = _STEP * (high - low)
         shifted = np.repeat(points[:, None], 1 + self.moving.size, axis=1)
         shifted[:, 1 + np.arange(self.moving.size), self.moving] += own
         values = self.table.residuals(shifted.reshape(-1, points.shape[1]))

@@ -120,8 +120,10 @@ class Experiment:
     @cached_property
     def blocks(self) -> int:
         """Blocks of the step responses that simulate the record."""
-        begin = min((float(drive.times[0]) for drive in self.drives if drive.moves), default=np.inf)
-        return blocks_of(self.mesh.lattice, begin) if begin < np.inf else 0
+        begins = [float(drive.times[0]) for drive in self.drives if drive.moves]
+        # samples may be read from before: readings of a step response reach back as far as these
+        times = self.mesh.lattice.times
+        return blocks_of(self.mesh.lattice, min([*begins, *times[:1].tolist()])) if begins else 0
 
 
 @final

@@ -457,6 +457,31 @@ def test_proportional_drives_are_simulated_once_and_all_the_same():
     assert AxisDrive(np.array([0.0, 5.0]), steps[0].values).over(steps[0]) is None
 
 
+@pytest.mark.parametrize("uneven", [False, True])
+def test_a_path_alone_responds_as_among_the_others(uneven, rng):
+    """Also where its drive moves long after another one, and whatever the delay."""
+    time = 0.2 * np.arange(300) + (0.05 * rng.random(300) if uneven else 0.0)
+    first, second = (
+        np.where(time > 4, 1.0, 0.3),
+        np.where(time > 31, 0.5, 0.0) + np.where(time > 40, 0.5, 0.0),
+    )
+    drives = (Axis("u", "V"), Axis("v", "V"))
+    record = Record("r", time, np.stack([first, second], axis=1), np.zeros((300, 2)), drives, (X, Y), "s")
+    whole = forward_model(
+        Layout.of(drives, (X, Y), ModelSettings(share="all", delay="path")), [record], [time]
+    )
+    delays, lag = np.array([0.0, 0.33, 2.4, 11.0]), np.full((4, 1), 1.7)
+    found = whole.unit_responses(Dynamics((lag,), (np.ones((4, 1)),), np.tile(delays[:, None], 4)))[0]
+    for response in range(2):
+        for drive in range(2):
+            path = whole.path(response, drive)
+            (alone,) = path.unit_responses(Dynamics((lag,), (np.ones((4, 1)),), delays[:, None]))
+            assert_allclose(alone[0], found[whole.layout.unit_of[response][drive]], rtol=0, atol=1e-9)
+            assert path.experiments[0].rest == record.drive[0, drive]
+    closed = -0.7 * np.expm1(-np.maximum(time - time[np.argmax(first > 0.5)] - delays[:, None], 0.0) / 1.7)
+    assert_allclose(found[whole.layout.unit_of[1][0]], closed, rtol=0, atol=2e-4)
+
+
 # What other commands share
 
 
