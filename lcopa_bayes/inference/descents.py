@@ -18,6 +18,8 @@ _AGREEING, _CLOSE = 0.25, 0.75
 """Gains over those promised above which damping stays, and above which it falls [-]."""
 _LESS, _MORE = 0.1, 4.0
 """Factors on a damping that falls and on one that grows [-]."""
+_AT_END = 1e-6
+"""Room up to which a coordinate is at its end [standard deviation of the information of itself]."""
 _FREE = 1.0
 """Largest damping at which a step that promises little shows an optimum [-]."""
 _FASTER, _HOPELESS = 100.0, 50.0
@@ -91,7 +93,7 @@ def _step(here: Place, damping: Vector, low: Matrix, high: Matrix) -> tuple[Matr
     curved = here.information / scale[:, :, None] / scale[:, None, :]
     curved += damping[:, None, None] * np.eye(scale.shape[1])
     slope = here.gradient / scale
-    still = ((low >= 0.0) & (slope < 0.0)) | ((high <= 0.0) & (slope > 0.0))
+    still = ((low * scale >= -_AT_END) & (slope < 0.0)) | ((high * scale <= _AT_END) & (slope > 0.0))
     step = _solved(curved, slope, still, np.zeros(slope.shape)) / scale
     promised = 0.5 * (step * here.gradient).sum(axis=1)
     leaving = (step < low) | (step > high)

@@ -58,19 +58,39 @@ class Valley:
         return points + steps
 
 
-@settings(deadline=None, max_examples=60)
-@given(st.integers(0, 10**6))
-def test_a_bowl_between_bounds_ends_at_the_solution_of_bounded_least_squares(seed):
+def bowl(seed: int) -> tuple[Bowl, Matrix]:
+    """A bowl whose bounds often hold its optimum, and four starts."""
     rng = np.random.default_rng(seed)
     matrix, right = rng.standard_normal((6, 3)), 3 * rng.standard_normal(6)
     low, high = -rng.uniform(0.1, 1.0, 3), rng.uniform(0.1, 1.0, 3)
-    bowl = Bowl(matrix, right, low, high)
-    start = rng.uniform(low, high, (4, 3))
-    ends = descended(bowl, start, steps=100, least=1e-12)
-    solution = lsq_linear(matrix, right, (low, high), tol=1e-13)
+    return Bowl(matrix, right, low, high), rng.uniform(low, high, (4, 3))
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 10**6))
+def test_a_bowl_between_bounds_ends_at_the_solution_of_bounded_least_squares(seed):
+    one, start = bowl(seed)
+    ends = descended(one, start, steps=15, least=1e-10)
+    solution = lsq_linear(one.matrix, one.right, (one.low, one.high), tol=1e-13)
     assert_allclose(ends.points, np.tile(solution.x, (4, 1)), atol=1e-4)
-    assert (ends.level >= bowl.at(start).level).all()
-    assert ((ends.points >= low - 1e-12) & (ends.points <= high + 1e-12)).all()
+    assert (ends.level >= one.at(start).level).all()
+    assert ((ends.points >= one.low - 1e-12) & (ends.points <= one.high + 1e-12)).all()
+
+
+def test_bounds_cost_a_bowl_few_steps():
+    counts = []
+    for seed in range(100):
+        (one, start), calls = bowl(seed), []
+
+        class Counted(Bowl):
+            def at(self, points: Matrix, calls: list[int] = calls) -> Place:
+                calls.append(len(points))
+                return super().at(points)
+
+        descended(Counted(one.matrix, one.right, one.low, one.high), start, steps=50, least=1e-10)
+        counts.append(len(calls))
+    assert np.median(counts) <= 3
+    assert max(counts) <= 10
 
 
 def test_a_curved_valley_is_followed_to_its_end():
