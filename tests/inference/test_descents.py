@@ -87,7 +87,7 @@ def test_bounds_cost_a_bowl_few_steps():
                 calls.append(len(points))
                 return super().at(points)
 
-        descended(Counted(one.matrix, one.right, one.low, one.high), start, steps=50, least=1e-10)
+        descended(Counted(one.matrix, one.right, one.low, one.high), start, steps=50, least=1e-8)
         counts.append(len(calls))
     assert np.median(counts) <= 3
     assert max(counts) <= 10
