@@ -225,12 +225,11 @@ def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Col
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
     for column, time in zip(axes["time"], values["time"], strict=True):
         late = [int(i) for i in np.flatnonzero(time[1:] <= time[:-1])]
-        rule = "does not come after the time of the row before,"
-        lines = [
-            f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; "
-            + ("keep one of both" if time[i + 1] == time[i] else "sort the rows")
-            for i in late
-        ]
+        rule, advice = (
+            "does not come after the time of the row before,",
+            "sort the rows, keep one of two alike",
+        )
+        lines = [f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; {advice}" for i in late]
         table.add(lines, table.place(column))
     if n_rows < 2:
         table.problems.append(f"{table.path}: has {n_rows} row(s) of data; a record needs two or more")

@@ -18,6 +18,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.inference.descents import solve_with_held
 from lcopa_bayes.inference.expansion import expanded
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -304,13 +305,7 @@ class Conditional:
         least = (_SHRINK - 1.0) * at.x
         fixed = shares & (step < least)
         if fixed.any():
-            held = np.where(fixed, least * scale, 0.0)
-            slope = slope - (curved @ held[..., None])[..., 0]
-            free = ~fixed
-            masked = (
-                curved * (free[:, :, None] & free[:, None, :]) + np.eye(scale.shape[1]) * fixed[:, :, None]
-            )
-            step = np.where(fixed, least, np.linalg.solve(masked, (slope * free)[..., None])[..., 0] / scale)
+            step = solve_with_held(curved, slope, fixed, least * scale) / scale
             step = np.where(shares, np.maximum(step, least), step)
         length = np.ones(len(step))
         for element in self.elements:

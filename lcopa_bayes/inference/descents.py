@@ -94,16 +94,16 @@ def _step(here: Place, damping: Vector, low: Matrix, high: Matrix) -> tuple[Matr
     curved += damping[:, None, None] * np.eye(scale.shape[1])
     slope = here.gradient / scale
     still = ((low * scale >= -_AT_END) & (slope < 0.0)) | ((high * scale <= _AT_END) & (slope > 0.0))
-    step = _solved(curved, slope, still, np.zeros(slope.shape)) / scale
+    step = solve_with_held(curved, slope, still, np.zeros(slope.shape)) / scale
     promised = 0.5 * (step * here.gradient).sum(axis=1)
     leaving = (step < low) | (step > high)
     if leaving.any():
         ends = np.where(leaving, np.clip(step, low, high), 0.0)
-        step = np.clip(_solved(curved, slope, still | leaving, ends * scale) / scale, low, high)
+        step = np.clip(solve_with_held(curved, slope, still | leaving, ends * scale) / scale, low, high)
     return step, promised, np.asarray(leaving.any(axis=1))
 
 
-def _solved(matrix: Array, right: Matrix, held: Flags, values: Matrix) -> Matrix:
+def solve_with_held(matrix: Array, right: Matrix, held: Flags, values: Matrix) -> Matrix:
     """Solutions of linear systems with the values of some of their unknowns held, (batch, size)."""
     free = ~held
     right = np.where(held, values, right - (matrix @ np.where(held, values, 0.0)[..., None])[..., 0])

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar, final
+from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.crew import ALONE
 from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -22,8 +23,6 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.spareterms import beside_spare_terms
 from lcopa_bayes.model.effects.effect import UnstableError
 
-T = TypeVar("T")
-R = TypeVar("R")
 _AT_ONCE = 8
 """Starts of a plant without effects that are descended from together, whatever the number of workers [-]."""
 _SCREENED, _FEWER = 1024, 512
@@ -104,7 +103,7 @@ def find_optima(
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
-    spare = beside_spare_terms(posterior, np.stack(weighty)) if (weighty := _weighty(found)) else []
+    spare = beside_spare_terms(posterior, np.array(_weighty(found))) if found else []
     if spare:
         found = _kept(posterior, [*found, *_descended(posterior, spare, crew=crew)])
         found = _recombined(posterior, found)
@@ -156,7 +155,7 @@ def again(
     """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
     without those of no weight. `begun` as `LeastSquares`."""
     found = _kept(posterior, _descended(posterior, _weighty(optima), rounds=1, crew=crew, begun=begun))
-    return _to_its_digits(posterior, found) if posterior.simulation is None else found
+    return _to_its_digits(posterior, found)
 
 
 def _weighty(optima: Sequence[Optimum]) -> list[Vector]:
@@ -199,7 +198,7 @@ def _held_at(
         return None
     reached = held.solve(start, evaluations=_SECTION[0], enough=_SECTION[1])[0]
     there = posterior.table.canonical(problem.with_noise(reached)[None])[0]
-    return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
+    return _describe(posterior, problem, there)
 
 
 def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
@@ -210,11 +209,9 @@ def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
     values = posterior.table.canonical(problem.values(inside, values)[None])[0]
     values = posterior.complete(posterior.coordinates(values[None]), None)[0]
     try:
-        values = problem.with_noise(values)
-        _, jacobian = problem.residual(problem.coordinates(values), values)
+        there = _describe(posterior, problem, problem.with_noise(values))
     except UnstableError:
         return None
-    there = _describe(posterior, problem, values, jacobian)
     return there if np.isfinite(there.log_density) else None
 
 
@@ -251,42 +248,25 @@ def _descended(
 ) -> list[Optimum]:
     """Optima from table values; a start from which effects leave no bounded response gives none."""
     problem, reached = LeastSquares(posterior), list[tuple[Vector, Matrix | None]]()
+    crew = crew or ALONE.sharing(posterior)
     if posterior.simulation is None:
         groups = np.array_split(starts, -(-len(starts) // _AT_ONCE)) if len(starts) else []
-        together = _each(partial(_together, rounds), posterior, groups, crew)
+        together = crew.each(partial(_together, rounds), groups)
         reached += [(values, None) for ends in together for values in ends]
     else:
-        alone = _each(partial(_descent, rounds, begun), posterior, starts, crew)
+        alone = crew.each(partial(_descent, rounds, begun), starts)
         reached += [end for end in alone if end is not None]
-    optima = list[Optimum]()
-    for values, jacobian in reached:
-        # at the solution itself: its terms may stand in another order than the search left them in, and the
-        # noise is that of its own residual
-        if jacobian is None:
-            _, jacobian = problem.residual(problem.coordinates(values), values)
-        optima.append(_describe(posterior, problem, values, jacobian))
-    return optima
+    return [_describe(posterior, problem, values, jacobian) for values, jacobian in reached]
 
 
 def _to_its_digits(posterior: Posterior, found: tuple[Optimum, ...]) -> tuple[Optimum, ...]:
-    """Optima of a plant without effects, the best of them to its digits."""
-    if not found:
+    """Optima, the best of them to its digits where it has no effects."""
+    if not found or posterior.simulation is not None:
         return found
     problem, (evaluations, enough) = LeastSquares(posterior), _LAST
     values = problem.solve(found[0].values, evaluations=evaluations, enough=enough)[0]
-    values = problem.with_noise(values)
-    _, jacobian = problem.residual(problem.coordinates(values), values)
-    return _kept(posterior, [_describe(posterior, problem, values, jacobian), *found[1:]])
-
-
-def _each(
-    task: Callable[[Posterior, T], R],
-    posterior: Posterior,
-    inputs: Sequence[T],
-    crew: Workers[Posterior] | None,
-) -> Iterator[R]:
-    """Results in the order of the inputs, by the crew where there is one."""
-    return map(partial(task, posterior), inputs) if crew is None else crew.each(task, inputs)
+    best = _describe(posterior, problem, problem.with_noise(values))
+    return _kept(posterior, [best, *found[1:]])
 
 
 def _together(rounds: int, posterior: Posterior, values: Matrix) -> Matrix:
@@ -359,9 +339,13 @@ def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
     return kept
 
 
-def _describe(posterior: Posterior, problem: LeastSquares, values: Vector, jacobian: Matrix) -> Optimum:
+def _describe(
+    posterior: Posterior, problem: LeastSquares, values: Vector, jacobian: Matrix | None = None
+) -> Optimum:
     """Optimum with the covariance of the sampled coordinates: the plant's at this noise, the noise's at this
-    plant."""
+    plant; with other slopes than those there where they are given."""
+    if jacobian is None:
+        _, jacobian = problem.residual(problem.coordinates(values), values)
     coordinates = posterior.coordinates(values[None])
     information = jacobian.T @ jacobian + np.diag(problem.prior_precision)
     blocks = [(problem.columns, covariance_of(information))]

@@ -79,4 +79,5 @@ class PlantDescents:
         return self.posterior.table.canonical(out)
 
     def _coordinates(self, points: Matrix) -> Matrix:
-        return np.array([self._problem.coordinates(one) for one in points])[:, self._chosen]
+        places = [self.posterior.sampled.index(k) for k in self._columns]
+        return self.posterior.coordinates(points)[:, places]

@@ -355,9 +355,9 @@ def _begun(search: LagSearch, lags: int, rng: np.random.Generator) -> Mixture:
     mass -= mass.max()
     counts = np.flatnonzero(mass > -_WEIGHTLESS)
     weights = np.exp(np.maximum(mass[counts], -_LIGHT))
+    log_times, delays = table.parts(np.arange(float(low.size))[None])
     means, factors = [], []
     for centre, covariance in zip(centres[counts], covariances[counts], strict=True):
-        log_times, delays = table.parts(np.arange(float(low.size))[None])
         times = np.array(table.parts(centre[None])[0])
         times[..., : search.apart] = -np.inf  # stays first
         ranks = np.argsort(times, axis=2)
