@@ -372,7 +372,7 @@ VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
     "audit": _on_study("audit", *_SAMPLING),
     "design": _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
     "compare": _on_study("compare", *_SAMPLING, "candidates", "described"),
-    "loop": _on_study("loop", "quick", "as_stated"),
+    "loop": _on_study("loop", "quick", "quiet", "as_stated"),
     "calibrate": _on_study(
         "calibrate",
         *(*_SAMPLING, "replicas", "around", "engine"),

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, final
 
 from lcopa_bayes.core.packing import Latest, packed
 from lcopa_bayes.core.parallel import Workers, imported_ahead, workers
+from lcopa_bayes.core.progress import Progress
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -22,10 +23,10 @@ class Crew:
     """`jobs` processes from `after` seconds on, this one alone before, and where `jobs` is 1; results do not
     depend on that. A context that ends the processes."""
 
-    def __init__(self, jobs: int = 1, *, after: float = 0.0) -> None:
-        """No process takes part yet; what they need is imported meanwhile."""
+    def __init__(self, jobs: int = 1, *, after: float = 0.0, bar: Progress | None = None) -> None:
+        """No process takes part yet; what they need is imported meanwhile. A `bar` counts tasks."""
         self.jobs, self._due, self._stack = jobs, monotonic() + after, ExitStack()
-        self._ended = False
+        self._ended, self._bar = False, bar
         if jobs > 1:
             imported_ahead()
 
@@ -37,6 +38,11 @@ class Crew:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
 
+    def stage(self, said: str) -> None:
+        """Name what is being done from now on, or say what is known by now."""
+        if self._bar is not None:
+            self._bar.set_description(said)
+
     def sharing(self, shared: S) -> Workers[S]:
         """Workers of a stage whose tasks share a value. It is pickled once, with what it has cached.
 
@@ -47,15 +53,29 @@ class Crew:
         work = lru_cache(1)(lambda task: partial(_done, task, common()))  # one task, however many inputs
 
         def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
+            result: Callable[[], R] = partial(task, shared, one)
             if not self._ended and self.jobs > 1 and monotonic() >= self._due and common() is not None:
-                return SimpleNamespace(result=partial(next, self._pool.each(work(task), [one])))
-            return SimpleNamespace(result=partial(task, shared, one))
+                result = partial(next, self._pool.each(work(task), [one]))
+            return SimpleNamespace(result=self._counted(result))
 
         return Workers(submit, iter)
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results of a function that needs nothing shared, in the order of the inputs."""
         return self.sharing(None).map(function, inputs)
+
+    def _counted(self, result: Callable[[], R]) -> Callable[[], R]:
+        """The same, counted when it is there."""
+        if self._bar is None:
+            return result
+        bar = self._bar
+
+        def counted() -> R:
+            value = result()
+            bar.update()
+            return value
+
+        return counted
 
     @cached_property
     def _pool(self) -> Workers[None]:

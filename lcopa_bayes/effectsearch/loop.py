@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.requirements import not_at_rest
 from lcopa_bayes.data.study import Study
@@ -21,7 +22,8 @@ from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
-from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.findings import Side, astray, findings_of, named_effects
+from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.integerplants import integer_dynamics
 from lcopa_bayes.effectsearch.lags import (
     ess_with_lags,
@@ -35,29 +37,18 @@ from lcopa_bayes.effectsearch.openeffects import (
     Weighed,
     alternatives,
     mixture,
-    odds,
     step_figures,
 )
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
-from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
+from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.refits import released
-from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
+from lcopa_bayes.effectsearch.rounds import Round, search, single_record
 from lcopa_bayes.effectsearch.scores import (
-    Score,
     State,
-    fit_scores,
-    held_out_scores,
-    left_out_scores,
-    over_noise,
-    risen,
 )
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import (
-    ALONE,
-    EXPLAINED,
-    RISEN,
-    Findings,
     Verdict,
     beside,
     decide,
@@ -76,19 +67,6 @@ _ASTRAY = (
     "the draws of the study predict the records held out worse than its optimum does and are not used: "
     "intervals and bands are those of a Laplace approximation there"
 )
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Side:
-    """Model and errors before or after."""
-
-    state: State
-    fit: tuple[Score, ...]
-    unseen: tuple[Score, ...]
-    """On held-out records, or with each fit record left out in turn."""
-    log_evidence: float
-    """Laplace approximation, noise held at its estimate [nat]."""
 
 
 @final
@@ -213,13 +191,14 @@ def loop(
     sample: bool = True,
     quick: bool = False,
     as_stated: bool = False,
+    quiet: bool = True,
 ) -> Loop:
     """Trace what a study's base model lacks; deterministic given the study's seed.
 
     Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
     `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
-    are drawn and ensembles are half as long. InputError when the study does not fit its records, or uses
-    effects already.
+    are drawn and ensembles are half as long. Unless `quiet` it says on standard error what it does and what
+    it knows by then. InputError when the study does not fit its records, or uses effects already.
     """
     if study.effects.use:
         raise InputError(
@@ -228,7 +207,11 @@ def loop(
         )
     kinds = offered(study) if library is None else list(library)
     # many small products: more threads only wait for each other
-    with threadpool_limits(1), Crew(jobs, after=_WORTHWHILE) as crew:
+    with (
+        threadpool_limits(1),
+        Progress(total=0, unit="task", quiet=quiet, desc="fitting the plant without effects") as bar,
+        Crew(jobs, after=_WORTHWHILE, bar=bar) as crew,
+    ):
         return _looped(study, kinds, crew, sample=sample, quick=quick, as_stated=as_stated)
 
 
@@ -242,8 +225,10 @@ def _looped(
     outliers = outlying(study, base)
     if outliers is not None:
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
+        crew.stage("fitting the plant again, without outlying samples")
         problem, base, start, enlarged, wider = based(study, kinds)
-    before = _side(problem, start)
+    before = Side.of(problem, start)
+    crew.stage(f"without effects {before.said}; looking for what is missing")
     contrary = disagreements((*study.fit, *study.held_out), crew)
     drifting = (one.as_drift for one in not_at_rest(problem.study.fit, problem.study.held_out))
     cautions = (*map(str, contrary), *drifting, *base.caution, *single_record(study))
@@ -274,12 +259,16 @@ def _looped(
             outliers=outliers,
             contrary=contrary,
         )
-    reached = _side(problem, searched.state)
+    reached = Side.of(problem, searched.state)
+    with_effects = f"with {', '.join(named_effects(searched.state)) or 'no effect'} {reached.said}"
+    crew.stage(f"{with_effects}; holding other plants against it")
     lags = lags_of(searched.state, problem) if chosen else ()
     dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
     if dynamics is None and chosen:
         dynamics = integer_dynamics(searched.state, problem)
-    findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
+    findings = findings_of(
+        study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone
+    )
     extended, others = searched.state.model.effects, wider if chosen else None
     plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others)
     lags = plants.held_against(lags, searched.state, problem)
@@ -295,7 +284,8 @@ def _looped(
     state = after.state
     if named:
         factors = state.model.wider
-        verdict = widened(verdict, {name: factors[name] for name in _names(state) if name in factors})
+        wide = {name: factors[name] for name in named_effects(state) if name in factors}
+        verdict = widened(verdict, wide)
     if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].alarmed:
         white = state.whitening  # something significant remains, which bands have to hold
         state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
@@ -304,19 +294,21 @@ def _looped(
         explained = explained_study(problem.study, state.model, outliers)
 
         def usable(draws: Draws, noise: Noise) -> bool:
-            return not _astray(after, _drawn(problem, state, (draws, noise)))
+            return not astray(after, Side.drawn(problem, state, (draws, noise)))
 
+        crew.stage(f"{verdict.kind}; drawing from the posterior")
         crew.close()
         values = state.model.values(state.optimum.x).tolist()
         known = dict(zip(state.model.posterior.table.names, values, strict=True))
         sampled = explained_draws(explained, usable, near=known, jobs=crew.jobs, quick=quick)
     if sampled is not None:
-        drawn = _drawn(problem, state, sampled)
-        if _astray(after, drawn):
+        drawn = Side.drawn(problem, state, sampled)
+        if astray(after, drawn):
             cautions, sampled = (*cautions, _ASTRAY), None
         else:
             after = drawn
-    after = _side(problem, state) if sampled is None and state is not after.state else after
+    after = Side.of(problem, state) if sampled is None and state is not after.state else after
+    crew.stage(f"{verdict.kind}; weighing what else the records leave open")
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
     if extended:
         plants = PlantsBeside.of(state, problem, others)
@@ -326,71 +318,3 @@ def _looped(
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
         *(outliers, contrary, found, lags, plants),
     )
-
-
-def _names(state: State) -> tuple[str, ...]:
-    """Effects of a model that have a name."""
-    return tuple(effect.name for effect in state.model.effects if not effect.card.dynamics)
-
-
-def _findings(
-    study: Study,
-    searched: Search,
-    before: Side,
-    after: Side,
-    *,
-    outliers: Outlying | None,
-    cautions: tuple[str, ...],
-    alone: bool,
-) -> Findings:
-    """What a search found, `before` without its effects and `after` with them."""
-    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
-    generics = (one for one in first.traced if one.card.place == "generic")
-    generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
-    added, names = searched.state.model.effects, _names(searched.state)
-    by_record = bool(added) and all(effect.card.per_record for effect in added)
-    was, now = before.unseen, after.unseen
-    if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
-        was, now = without_outliers(was, now)
-    return Findings(
-        cautions=cautions,
-        alarmed=searched.rounds[0].alarmed or bool(added),
-        largest=searched.rounds[0].largest,
-        threshold=first.threshold,
-        effects=names,
-        dynamics=len(names) < len(added),
-        apart=searched.apart,
-        disturbances=tuple(effect.name for effect in added if effect.card.disturbance),
-        gained=searched.gained,
-        generic=generic.log_bayes_factor if generic else -np.inf,
-        generic_name=generic.name if generic else "",
-        remaining=last.largest,
-        remaining_threshold=last.threshold,
-        remaining_name=last.leader.name if last.leader else "",
-        share=searched.share,
-        excess=before.state.whitening.excess(before.state.optimum.residual),
-        enough=ALONE if alone else EXPLAINED,
-        scatter=first.scatter,
-        missed=None if by_record else missed(study, after.fit, now, searched.state),
-        unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
-        risen=np.nan if by_record else risen(was, now),
-        reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
-        nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
-    )
-
-
-def _drawn(problem: Problem, state: State, sampled: tuple[Draws, Noise]) -> Side:
-    """The same by draws of the explained study."""
-    covariance = np.asarray(np.cov(coordinates_of(state.model, sampled[0]).T))
-    return _side(problem, replace(state, spread=covariance, sampled=sampled))
-
-
-def _astray(optimum: Side, drawn: Side) -> bool:
-    """Whether draws predict records held out worse than the optimum of the loop."""
-    return bool(optimum.unseen[0].held_out) and risen(optimum.unseen, drawn.unseen) > RISEN
-
-
-def _side(problem: Problem, state: State) -> Side:
-    unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
-    return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

@@ -126,6 +126,8 @@ def search(
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
+        beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
+        crew.stage(f"refitting with each effect that comes into question{beside}")
         refits, failures = refitted(state, seen, crew)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)

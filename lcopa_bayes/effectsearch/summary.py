@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
+from lcopa_bayes.effectsearch.findings import Side
 from lcopa_bayes.effectsearch.lags import ess_with_lags
-from lcopa_bayes.effectsearch.loop import Loop, Side
+from lcopa_bayes.effectsearch.loop import Loop
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse

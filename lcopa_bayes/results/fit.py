@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -204,7 +205,10 @@ def fit(
     plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
     if around_optima or (problem.posterior.simulation is not None and plan.method == "auto"):
         problem, begun = weighted_start(problem, quick=quick)
+        begin = monotonic()
         weighted_result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=begun)
+        if plan.seconds is not None:  # ensembles have what is left
+            plan = replace(plan, seconds=max(begin + plan.seconds - monotonic(), 0.0))
     else:
         problem, optima = resolved_optima(problem, searched[1] if searched else optima_of(problem))
     if weighted_result is not None:

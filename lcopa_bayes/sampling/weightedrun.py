@@ -8,8 +8,9 @@ and ensembles follow where weights fail.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from time import monotonic
 from typing import final
 
 import numpy as np
@@ -22,7 +23,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.sampling.convergence import Limitation, qualities
 from lcopa_bayes.sampling.coordinates import Mapped, spread
-from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.draws import Draws, gather, shortfall
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.importance import LEAST_EFFICIENCY, Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
@@ -73,8 +74,14 @@ def weighted_run(
     """Importance draws as a run, and its draws; None where no weights are usable.
 
     `optima` are those of the posterior where they are known; else they are searched for. Deterministic given
-    the plan's seed, whatever `jobs` [processes].
+    the plan's seed, whatever `jobs` [processes]; with a budget of `plan.seconds`, after which no further
+    proposal is fitted, on the speed of the machine too.
     """
+    begin = monotonic()
+
+    def late() -> bool:
+        return plan.seconds is not None and monotonic() > begin + plan.seconds
+
     rng = np.random.default_rng([plan.seed, _STREAM])
     size = min(plan.target_ess, 400.0) if quick else plan.target_ess
     wanted = replace(_QUICK if quick else _PLAN, wanted=size)
@@ -86,17 +93,19 @@ def weighted_run(
         near, weighted, share = posterior, None, 0.0
         chosen = weighty(optima)
         if posterior.simulation is not None and _together(posterior, chosen):
-            near, weighted, share = _by_surrogate(posterior, chosen[0], rng, size, mapped)
+            near, weighted, share = _by_surrogate(posterior, chosen[0], rng, size, mapped, late)
         if weighted is None or not usable(weighted):
-            tried = importance(posterior, optima, rng, wanted, mapped)
+            tried = importance(posterior, optima, rng, wanted, mapped, late)
             if tried is None:
                 return None
             near, weighted = posterior, tried.weighted
             share = weighted.ess / weighted.count
     if not usable(weighted):
         return None
-    run = Run((), plan, weighted, surrogate=near.surrogate)
+    stopped = monotonic() - begin if late() else None
+    run = Run((), plan, weighted, surrogate=near.surrogate, stopped_after=stopped)
     draws = gather(near, run)
+    draws = draws.limited(shortfall(run, draws))
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
             [
@@ -124,7 +133,12 @@ def _together(posterior: Posterior, optima: Sequence[Optimum]) -> bool:
 
 
 def _by_surrogate(
-    posterior: Posterior, optimum: Optimum, rng: np.random.Generator, wanted: float, mapped: Mapped
+    posterior: Posterior,
+    optimum: Optimum,
+    rng: np.random.Generator,
+    wanted: float,
+    mapped: Mapped,
+    late: Callable[[], bool],
 ) -> tuple[Posterior, Weighted | None, float]:
     """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
     efficient they can be called [-]. No draws where the surrogate does not hold.
@@ -138,7 +152,7 @@ def _by_surrogate(
     near = replace(posterior, surrogate=surrogate)
     # rounds of it cost little beside walkers, who show what a proposal misses that is not efficient
     enough = replace(_PLAN, wanted=_SURPLUS * wanted)
-    about_optimum = importance(near, [optimum], rng, enough, mapped)
+    about_optimum = importance(near, [optimum], rng, enough, mapped, late)
     if about_optimum is None or about_optimum.weighted.ess < _FEWEST:
         return posterior, None, 0.0
     first = about_optimum.weighted

@@ -85,19 +85,20 @@ def loop(
     jobs: int = 1,
     folder: Path | str | None = None,
     quick: bool = False,
+    quiet: bool = True,
 ) -> LoopResult:
     """Hold the residual of a study's fit against the catalogue of effects, refit with the best, and score
     both.
 
     Parameters: `study`, or a fit of it; `as_stated`, keep the number of viscous terms that the study states;
     `jobs`, processes to use; `folder`, a run folder to write into; `quick`, fewer chance residuals and
-    shorter ensembles. InputError as `fit`.
+    shorter ensembles; `quiet`, no word of what is being done. InputError as `fit`.
     """
     wanted = with_least_terms(study_of(study))  # the search chooses its structure itself
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with opened(folder, origin):
-        outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
+        outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated, quiet=quiet)
         curves = json.dumps(plain(drawn(outcome)), indent=1, allow_nan=False) + "\n"
         values = results(outcome) | {"explained": EXPLAINED}
         return LoopResult(values, origin, {CURVES: curves}, study=outcome.study).kept(folder)

@@ -15,8 +15,9 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.findings import Side
 from lcopa_bayes.effectsearch.heldouteffects import missed
-from lcopa_bayes.effectsearch.loop import Side, _side, loop
+from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.scores import State, risen
 from lcopa_bayes.effectsearch.verdict import CHANCE, RISEN
 from lcopa_bayes.inference.assembly import problem_of
@@ -54,7 +55,7 @@ def fitted(study: Study) -> tuple[Side, State]:
     base = base_fit(ExtendedModel(problem.posterior), np.random.default_rng(0))
     assert not base.failed
     state = State(base.model, base.optimum, base.regression.whitening)
-    return _side(problem, state), state
+    return Side.of(problem, state), state
 
 
 def p_values(kind: str, seeds: range) -> np.ndarray:

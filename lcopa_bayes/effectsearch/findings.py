@@ -1,0 +1,117 @@
+"""What a search found, as a verdict takes it: errors before and after, and what remains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self, final
+
+import numpy as np
+
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.explained import coordinates_of
+from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.openeffects import odds
+from lcopa_bayes.effectsearch.outliers import Outlying, without_outliers
+from lcopa_bayes.effectsearch.rounds import Search
+from lcopa_bayes.effectsearch.scores import (
+    Score,
+    State,
+    fit_scores,
+    held_out_scores,
+    left_out_scores,
+    over_noise,
+    risen,
+)
+from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, RISEN, Findings
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.noise import Noise
+from lcopa_bayes.sampling.draws import Draws
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Model and errors before or after."""
+
+    state: State
+    fit: tuple[Score, ...]
+    unseen: tuple[Score, ...]
+    """On held-out records, or with each fit record left out in turn."""
+    log_evidence: float
+    """Laplace approximation, noise held at its estimate [nat]."""
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> Self:
+        """Those of a state."""
+        unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
+        log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
+        return cls(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)
+
+    @classmethod
+    def drawn(cls, problem: Problem, state: State, sampled: tuple[Draws, Noise]) -> Self:
+        """The same by draws of the explained study."""
+        covariance = np.asarray(np.cov(coordinates_of(state.model, sampled[0]).T))
+        return cls.of(problem, replace(state, spread=covariance, sampled=sampled))
+
+    @property
+    def said(self) -> str:
+        """The errors in a few words."""
+        where = "held out" if self.unseen[0].held_out else "left out"
+        fitted, unseen = (over_noise(scores, scores, clear=False) for scores in (self.fit, self.unseen))
+        return f"errors {fitted:.2f} times the noise fitted, {unseen:.2f} {where}"
+
+
+def named_effects(state: State) -> tuple[str, ...]:
+    """Effects of a model that have a name."""
+    return tuple(effect.name for effect in state.model.effects if not effect.card.dynamics)
+
+
+def findings_of(
+    study: Study,
+    searched: Search,
+    before: Side,
+    after: Side,
+    *,
+    outliers: Outlying | None,
+    cautions: tuple[str, ...],
+    alone: bool,
+) -> Findings:
+    """What a search found, `before` without its effects and `after` with them."""
+    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    generics = (one for one in first.traced if one.card.place == "generic")
+    generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
+    added, names = searched.state.model.effects, named_effects(searched.state)
+    by_record = bool(added) and all(effect.card.per_record for effect in added)
+    was, now = before.unseen, after.unseen
+    if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
+        was, now = without_outliers(was, now)
+    return Findings(
+        cautions=cautions,
+        alarmed=searched.rounds[0].alarmed or bool(added),
+        largest=searched.rounds[0].largest,
+        threshold=first.threshold,
+        effects=names,
+        dynamics=len(names) < len(added),
+        apart=searched.apart,
+        disturbances=tuple(effect.name for effect in added if effect.card.disturbance),
+        gained=searched.gained,
+        generic=generic.log_bayes_factor if generic else -np.inf,
+        generic_name=generic.name if generic else "",
+        remaining=last.largest,
+        remaining_threshold=last.threshold,
+        remaining_name=last.leader.name if last.leader else "",
+        share=searched.share,
+        excess=before.state.whitening.excess(before.state.optimum.residual),
+        enough=ALONE if alone else EXPLAINED,
+        scatter=first.scatter,
+        missed=None if by_record else missed(study, after.fit, now, searched.state),
+        unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
+        risen=np.nan if by_record else risen(was, now),
+        reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
+        nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
+    )
+
+
+def astray(optimum: Side, drawn: Side) -> bool:
+    """Whether draws predict records held out worse than the optimum of the loop."""
+    return bool(optimum.unseen[0].held_out) and risen(optimum.unseen, drawn.unseen) > RISEN
