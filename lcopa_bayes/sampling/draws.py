@@ -130,7 +130,7 @@ def shortfall(run: Run, draws: Draws) -> tuple[Limitation, ...]:
     return (
         Limitation(
             "tentative",
-            f"the budget of {run.plan.seconds:.3g} s ended sampling: the smallest effective sample size is "
+            f"the budget of {run.plan.seconds:.4g} s ended sampling: the smallest effective sample size is "
             f"{draws.ess:.0f} where {target:g} are wanted, the largest R-hat {rhat:.3f}",
             f"give it about {more:.0f} s more by [sampler] seconds",
         ),

@@ -14,6 +14,7 @@ from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch import findings
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -421,7 +422,7 @@ def test_the_error_that_has_risen_is_that_of_the_worst_axis(clean):
 
 def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypatch):
     """As of another mode: the error after a loop is never above that before it."""
-    scores = loops.held_out_scores
+    scores = findings.held_out_scores
 
     def away(state, problem):
         made = scores(replace(state, sampled=None), problem)
@@ -431,8 +432,9 @@ def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypat
         return np.random.default_rng(0).normal(size=(50, len(model.names)))
 
     monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: ("draws", None))
-    monkeypatch.setattr(loops, "coordinates_of", around)
-    monkeypatch.setattr(loops, "held_out_scores", away)
+    for module in (loops, findings):
+        monkeypatch.setattr(module, "coordinates_of", around)
+    monkeypatch.setattr(findings, "held_out_scores", away)
     found = loop(study(1), library=LIBRARY, quick=True, as_stated=True)
     assert found.draws is None
     assert any("are not used" in caution for caution in found.cautions)
