@@ -3,7 +3,8 @@
 A search chooses the number of terms of a family; steady values and delays depend on that family where the
 records do not show them (`results.sumsoflags`). What nonlinear effects add at the optimum is taken off the
 records first. What is linear and does not change with time may be part of the plant as well as an effect:
-sums of lags stand for both, and a linear effect is named only where they have no support.
+sums of lags stand for both, and a linear effect is named only where they have no support and where it is
+ahead of them by more than the best of all effects is by chance, whatever their number of parameters.
 """
 
 from __future__ import annotations
@@ -65,15 +66,19 @@ def fitted_plant(state: State, problem: Problem) -> FittedPlant:
     )
 
 
-def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[int]) -> Dynamics | None:
+def linear_dynamics(
+    state: State, found: Sequence[Alternative], quiet: Sequence[int], chance: float
+) -> Dynamics | None:
     """Sums of lags, where they are all that the fitted records ask for; None where they are not.
 
     They are where no effect of a final model is nonlinear, they have support on every response axis on which
     a linear one acts, or without any on one at least, and leave, or the plant where that is better, no more
-    than the noise, which is known from so many `quiet` samples of each axis.
+    than the noise, which is known from so many `quiet` samples of each axis. Beside an effect they have
+    support too where its likelihood is above theirs by no more than `chance` gives the best of all effects
+    [nat].
     """
     effects = state.model.effects
-    supported = [one for one in found if one.support != "plant"]
+    supported = [one for one in found if one.support != "plant" or (effects and _behind(one) <= chance)]
     if not supported or not all(linear(effect) for effect in effects):
         return None
     acting = _acting(state, [effect.name for effect in effects])
@@ -93,6 +98,11 @@ def _at_noise(one: Alternative, quiet: int) -> bool:
     best = one.search.best
     chance = f_distribution.ppf(_CHANCE, best.size, quiet) if quiet else np.inf
     return bool(min(one.square, best.square) / best.size <= max(REACHED**2, chance))
+
+
+def _behind(one: Alternative) -> float:
+    """What sums of lags lack in log likelihood of the plant and its effects [nat]."""
+    return 0.5 * (one.search.best.square - one.square)
 
 
 def linear(effect: Effect) -> bool:

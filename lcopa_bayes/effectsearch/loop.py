@@ -263,7 +263,8 @@ def _looped(
     with_effects = f"with {', '.join(named_effects(searched.state)) or 'no effect'} {reached.said}"
     crew.stage(f"{with_effects}; holding other plants against it")
     lags = lags_of(searched.state, problem) if chosen else ()
-    dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
+    chance = searched.rounds[0].trace.threshold
+    dynamics = linear_dynamics(searched.state, lags, base.noise_samples, chance)
     if dynamics is None and chosen:
         dynamics = integer_dynamics(searched.state, problem)
     findings = findings_of(

@@ -133,11 +133,15 @@ def test_a_linear_effect_is_weighed_with_its_parameters_and_named_where_lags_hav
     expected = square + 2 * (free + 1) - best.square - 2 * best.parameters
     assert one.advantage == pytest.approx(expected, abs=0.1)
     quiet = chain.base.noise_samples
-    assert linear_dynamics(lagged, [one], quiet)
-    assert not linear_dynamics(lagged, [replace(one, advantage=-11.0)], quiet)
-    assert not linear_dynamics(lagged, [one], [100_000])  # its residual is too large for noise so well known
+    assert linear_dynamics(lagged, [one], quiet, -np.inf)
+    # without support they still follow as well unless the effect is ahead by more than chance gives
+    far, ahead = replace(one, advantage=-11.0), 0.5 * (best.square - square)
+    assert linear_dynamics(lagged, [far], quiet, ahead + 0.1)
+    assert not linear_dynamics(lagged, [far], quiet, ahead - 0.1)
+    assert not linear_dynamics(lagged, [one], [100_000], 8.0)  # its residual is too large for that noise
+    assert not linear_dynamics(chain.before.state, [far], quiet, np.inf)  # no effect to be held against
     model = model.having(lag, RiseFallAsymmetry())
     beside = replace(
         lagged, model=model, optimum=Regression(model, state.whitening).at(np.append(optimum.x, 0.1))
     )
-    assert not linear_dynamics(beside, [one], quiet)
+    assert not linear_dynamics(beside, [one], quiet, np.inf)

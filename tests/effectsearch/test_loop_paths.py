@@ -118,6 +118,6 @@ def test_figures_of_the_path_are_over_the_lags_and_those_of_the_other_are_not():
 
 
 def test_linear_dynamics_of_one_path_are_named_as_such():
-    dynamics = linear_dynamics(based().start, found(), based().fit.noise_samples)
+    dynamics = linear_dynamics(based().start, found(), based().fit.noise_samples, 0.0)
     assert dynamics is not None
     assert "lags follow y_u2" in dynamics.said
