@@ -14,12 +14,15 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.verbs.compare import compare
 from lcopa_bayes.verbs.fit import fit
@@ -30,13 +33,21 @@ VERBS = ("fit", "loop", "compare")
 HEADS: tuple[str, ...] = ("record", "structure", "grade", "sums of lags", "held out, RMSE", "fit [CPU s]")
 HEADS += ("loop", "names", "held out / noise", "loop [CPU s]")
 HEADS += ("preferred", "fractional orders", "compare [CPU s]")
-QUICK = ("silverbox", "cd_player_arm")
-"""Records of many samples, whose loop ends without draws and whose candidates take a quarter of the steps."""
+QUICK, BUDGET = ("silverbox", "cd_player_arm"), 300.0
+"""Records of many samples, whose sampling ends after so long [s], and whose loop and candidates take fewer
+steps."""
+
+
+def measured(folder: Path) -> Study:
+    """The study of a record, with a budget where it is one of many samples."""
+    study = load_study(folder)
+    seconds = BUDGET if folder.name in QUICK else study.sampler.seconds
+    return replace(study, sampler=replace(study.sampler, seconds=seconds))
 
 
 def fitted(folder: Path) -> dict[str, Any]:
     """What a fit says."""
-    result = fit(folder)
+    result = fit(measured(folder))
     assert isinstance(result, Fit)
     other = result.alternatives
     return {
@@ -51,7 +62,7 @@ def fitted(folder: Path) -> dict[str, Any]:
 
 def looped(folder: Path) -> dict[str, Any]:
     """What the loop says."""
-    result = loop(folder, quick=folder.name in QUICK)
+    result = loop(measured(folder), quick=folder.name in QUICK)
     values = result.to_json()
     sides = {
         side: {kind: values[side][f"{kind}_rmse_over_noise"] for kind in ("fit", "held_out")}
@@ -69,7 +80,7 @@ def looped(folder: Path) -> dict[str, Any]:
 
 def compared(folder: Path) -> dict[str, Any]:
     """What a comparison of the candidates of the study says."""
-    values = compare(folder, quick=folder.name in QUICK).values
+    values = compare(measured(folder), quick=folder.name in QUICK).values
     return {
         "preferred": values["preferred"],
         "why": values["why"],
