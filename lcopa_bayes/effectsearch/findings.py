@@ -56,9 +56,9 @@ class Side:
     @property
     def said(self) -> str:
         """The errors in a few words."""
-        where = "held out" if self.unseen[0].held_out else "left out"
+        where = "held out" if any(one.held_out for one in self.unseen) else "left out in turn"
         fitted, unseen = (over_noise(scores, scores, clear=False) for scores in (self.fit, self.unseen))
-        return f"errors {fitted:.2f} times the noise fitted, {unseen:.2f} {where}"
+        return f"errors are {fitted:.2f} times the noise on fitted records, {unseen:.2f} on those {where}"
 
 
 def named_effects(state: State) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, final
@@ -14,6 +14,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.requirements import not_at_rest
 from lcopa_bayes.data.study import Study
@@ -43,7 +44,7 @@ from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.refits import released
-from lcopa_bayes.effectsearch.rounds import Round, search, single_record
+from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
 from lcopa_bayes.effectsearch.scores import (
     State,
 )
@@ -236,19 +237,8 @@ def _looped(
     searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
     if not wrong or (base.smooth and wrong == base.failed):
         rng = np.random.default_rng([study.seed, 11])
-        searched = search(
-            start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone, crew=crew
-        )
-        if base.noise_known and not searched.rounds[-1].trace.alarmed:
-            searched = searched.settled
-            if not all(one.firm for one in base.noise) and not searched.state.model.effects:
-                # too few samples at rest leave noise plausible in which every effect drowns
-                unknown = (0,) * len(base.noise)
-                searched = search(
-                    searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone, crew=crew
-                )
-                searched = searched.settled
-        searched = replace(searched, state=released(searched.state))
+        rounds = partial(search, library=kinds, rng=rng, draws=draws, alone=alone, crew=crew)
+        searched = _searched(start, base, rounds)
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if searched is None or (wrong and too_smooth(searched.state.optimum)):
         seen = missed(study, before.fit, before.unseen, start)
@@ -260,8 +250,8 @@ def _looped(
             contrary=contrary,
         )
     reached = Side.of(problem, searched.state)
-    with_effects = f"with {', '.join(named_effects(searched.state)) or 'no effect'} {reached.said}"
-    crew.stage(f"{with_effects}; holding other plants against it")
+    added = listed(named_effects(searched.state)) or "no effect"
+    crew.stage(f"with {added} {reached.said}; holding other plants against it")
     lags = lags_of(searched.state, problem) if chosen else ()
     chance = searched.rounds[0].trace.threshold
     dynamics = linear_dynamics(searched.state, lags, base.noise_samples, chance)
@@ -290,24 +280,15 @@ def _looped(
     if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].alarmed:
         white = state.whitening  # something significant remains, which bands have to hold
         state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
-    sampled = None
+    drawn, sampled = None, None
     if sample and declarable(study, state.model.effects):
-        explained = explained_study(problem.study, state.model, outliers)
-
-        def usable(draws: Draws, noise: Noise) -> bool:
-            return not astray(after, Side.drawn(problem, state, (draws, noise)))
-
         crew.stage(f"{verdict.kind}; drawing from the posterior")
         crew.close()
-        values = state.model.values(state.optimum.x).tolist()
-        known = dict(zip(state.model.posterior.table.names, values, strict=True))
-        sampled = explained_draws(explained, usable, near=known, jobs=crew.jobs, quick=quick)
-    if sampled is not None:
-        drawn = Side.drawn(problem, state, sampled)
-        if astray(after, drawn):
-            cautions, sampled = (*cautions, _ASTRAY), None
-        else:
-            after = drawn
+        drawn = _drawn(problem, state, after, outliers, jobs=crew.jobs, quick=quick)
+    if drawn is not None and astray(after, drawn):
+        cautions = (*cautions, _ASTRAY)
+    elif drawn is not None:
+        after, sampled = drawn, drawn.state.sampled
     after = Side.of(problem, state) if sampled is None and state is not after.state else after
     crew.stage(f"{verdict.kind}; weighing what else the records leave open")
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
@@ -319,3 +300,30 @@ def _looped(
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
         *(outliers, contrary, found, lags, plants),
     )
+
+
+def _searched(start: State, base: BaseFit, rounds: Callable[..., Search]) -> Search:
+    """Rounds under the noise that was measured; where too few samples at rest measured it and nothing stands
+    out, again under noise known from the residual alone."""
+    found = rounds(start, noise_samples=base.noise_samples)
+    if base.noise_known and not found.rounds[-1].trace.alarmed:
+        found = found.settled
+        if not all(one.firm for one in base.noise) and not found.state.model.effects:
+            # too few samples at rest leave noise plausible in which every effect drowns
+            found = rounds(found.state, noise_samples=(0,) * len(base.noise)).settled
+    return replace(found, state=released(found.state))
+
+
+def _drawn(
+    problem: Problem, state: State, optimum: Side, outliers: Outlying | None, *, jobs: int, quick: bool
+) -> Side | None:
+    """A side by draws of the explained study; None where there are none."""
+
+    def usable(draws: Draws, noise: Noise) -> bool:
+        return not astray(optimum, Side.drawn(problem, state, (draws, noise)))
+
+    explained = explained_study(problem.study, state.model, outliers)
+    values = state.model.values(state.optimum.x).tolist()
+    known = dict(zip(state.model.posterior.table.names, values, strict=True))
+    sampled = explained_draws(explained, usable, near=known, jobs=jobs, quick=quick)
+    return None if sampled is None else Side.drawn(problem, state, sampled)

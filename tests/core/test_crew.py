@@ -9,6 +9,7 @@ import pytest
 from lcopa_bayes.core import crew as module
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.progress import Progress
 
 
 def scaled(shared, one):
@@ -68,3 +69,13 @@ def test_errors_are_those_of_the_task():
         list(crew.sharing(1).each(divided, [1, 0]))
     with pytest.raises(InputError, match="a worker process ended"), Crew(2) as crew:
         list(crew.sharing(1).each(ended, [1]))
+
+
+def test_a_bar_counts_tasks_and_names_the_stage(capsys):
+    with Progress(total=0, unit="task", desc="begun") as bar, Crew(1, bar=bar) as crew:
+        assert [value for value, _ in crew.sharing(10).each(scaled, [1, 2])] == [10, 20]
+        crew.stage("going on")
+        assert bar.n == 2
+    assert "going on: 2 tasks" in capsys.readouterr().err
+    ALONE.stage("nothing to be seen")
+    assert capsys.readouterr().err == ""

@@ -122,6 +122,17 @@ def test_errors_fall_to_the_noise_floor(bent):
     ]  # one offset for all records
 
 
+def test_what_is_known_is_said_as_the_search_goes_on(capsys):
+    """Second method: the errors of the result."""
+    found = loop(study(2, 0.06), library=LIBRARY, sample=False, quick=True, as_stated=True, quiet=False)
+    said, reported = capsys.readouterr().err, results(found)
+    for side, name in (("before", "without effects"), ("after", "with odd_curvature")):
+        fitted, unseen = (reported[side][f"{kind}_rmse_over_noise"]["x"] for kind in ("fit", "held_out"))
+        where = f"{fitted:.2f} times the noise on fitted records, {unseen:.2f} on those held out"
+        assert f"{name} errors are {where}" in said
+    assert "explained" in said
+
+
 def test_held_out_bands_by_draws_are_those_of_the_linearised_model(clean):
     """Draws through the model, or its tangents on the record; 100 draws know a variance to 14 %."""
     state, (score,) = clean.before.state, clean.before.unseen
