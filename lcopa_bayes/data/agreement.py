@@ -20,7 +20,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.crew import ALONE, Crew
-from lcopa_bayes.data.description import FOLLOWED, Described, LaggedSum
+from lcopa_bayes.data.description import FOLLOWED, Described, Followed, LaggedSum
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
 
@@ -98,7 +98,7 @@ def disagreements(records: Sequence[Record], crew: Crew = ALONE) -> tuple[Disagr
     lags = np.geomspace(period, span, _LAGS)
     described = [one for one in crew.sharing(lags).each(_described, records) if one is not None]
     leads = [
-        max((-seen[0] for seen in _judged(one) if _runs_ahead(*seen, period)), default=0.0)
+        max((-seen.delay for seen in _judged(one) if _runs_ahead(seen, period)), default=0.0)
         for one in described
     ]
     at_once = {one.name for one in records if any(_moves_at_once(one))}
@@ -112,7 +112,7 @@ def disagreements(records: Sequence[Record], crew: Crew = ALONE) -> tuple[Disagr
     rest = [one for one, lead in zip(described, leads, strict=True) if lead <= 0.0]
     if len(rest) < 2:
         return tuple(ahead)
-    delay = float(np.median([max(delay, 0.0) for one in rest for delay, *_ in one.best]))
+    delay = float(np.median([max(seen.delay, 0.0) for one in rest for seen in one.best]))
     pairs: list[Disagreement] = []
     joint: list[Disagreement] = []
     for one in rest:
@@ -138,15 +138,16 @@ def _severity(one: Disagreement) -> tuple[bool, bool, float]:
     return not one.gross, np.isfinite(one.ratio), one.misfit
 
 
-def _judged(one: Described) -> list[tuple[float, float, float]]:
+def _judged(one: Described) -> list[Followed]:
     """What is best of the axes that say when a record's clock ran: those that are followed closely, where
     there are any; noise of long memory is ahead of anything on an axis that hardly moves."""
-    return [seen for seen in one.best if seen[1] <= 1 - _CLOSELY] or list(one.best)
+    return [seen for seen in one.best if seen.misfit <= 1 - _CLOSELY] or list(one.best)
 
 
-def _runs_ahead(delay: float, misfit: float, causal: float, period: float) -> bool:
-    """Whether a response is described so well by the drive of later times alone."""
-    return -delay > period and causal > max(1 - _CLOSELY, _AHEAD * misfit)
+def _runs_ahead(seen: Followed, period: float) -> bool:
+    """Whether a response is described so well by the drive of later times alone, and moves before it."""
+    alone = seen.other > max(1 - _CLOSELY, _AHEAD * seen.misfit)
+    return -seen.delay > period and alone and not seen.rests
 
 
 def _ahead(record: Record, lead: float) -> Disagreement:

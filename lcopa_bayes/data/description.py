@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy import signal
@@ -30,6 +30,8 @@ _SAMPLES, _CHANGES = 1_500, 20_000
 """Samples of a record that are described, and changes of a drive that act on them, at most."""
 _FEWEST = 20
 """Samples of an axis without which it is not described."""
+_AT_REST = 8
+"""Samples before the first change of a drive that show whether a response rests there, at least [-]."""
 _NEAR = 1e-3
 """Accuracy of a delay, over the step between those that are tried [-]."""
 _PRIOR = 30.0
@@ -38,6 +40,19 @@ _RHO = 0.99
 """Largest correlation of noise from sample to sample [-]."""
 _EXACT = 1e-12
 """Least variance of noise, over the square of the response's range [-]."""
+
+
+class Followed(NamedTuple):
+    """How a description follows a response axis."""
+
+    delay: float
+    """Of the least misfit, 0 where nothing is followed [time unit]."""
+    misfit: float
+    """Residual variance with it, over the variance of the response [-]."""
+    other: float
+    """The least one of delays of the other sign [-]."""
+    rests: bool
+    """Whether the response rests before a drive first changes, where an advance of that size moves it."""
 
 
 @final
@@ -124,15 +139,28 @@ class Described:
         return LaggedSum.of(columns[known], self.response[known, axis]).misfit
 
     @cached_property
-    def best(self) -> tuple[tuple[float, float, float], ...]:
-        """Of every sampled axis, the delay of the least misfit, 0 where nothing is followed [time unit], that
-        misfit, and the least one of delays of the other sign [-]."""
+    def best(self) -> tuple[Followed, ...]:
+        """Of every sampled axis."""
         return tuple(self._best(axis) for axis in range(self.response.shape[1]) if self.sampled(axis))
 
-    def _best(self, axis: int) -> tuple[float, float, float]:
+    def _best(self, axis: int) -> Followed:
         late, early = (self._nearby(axis, self.delays[side]) for side in (self.delays >= 0, self.delays < 0))
         (delay, misfit), (_, other) = sorted((late, early), key=lambda one: one[1])
-        return delay if misfit <= 1 - FOLLOWED else 0.0, misfit, other
+        followed = misfit <= 1 - FOLLOWED
+        rests = followed and delay < 0.0 and self._rests(axis, -delay)
+        return Followed(delay if followed else 0.0, misfit, other, rests)
+
+    def _rests(self, axis: int, lead: float) -> bool:
+        """Whether the samples of an axis within a `lead` [time unit] before the first change of a drive, of
+        which there are enough, are closer to their mean than to the description with that advance."""
+        first = min(self.drives[j].times[0] for j in self.moving)
+        seen = np.isfinite(self.response[:, axis])
+        before = seen & (first - lead <= self.time) & (self.time < first)
+        if np.count_nonzero(before) < _AT_REST:
+            return False
+        columns, response = self.columns(-lead).reshape(self.time.size, -1), self.response[:, axis]
+        left = response - columns @ LaggedSum.of(columns, response).coefficients
+        return bool(np.var(response[before]) < np.mean((left[before] - left[seen].mean()) ** 2))
 
     def _nearby(self, axis: int, delays: Vector) -> tuple[float, float]:
         """The delay of the least misfit among some and between its neighbours [time unit]; that misfit."""

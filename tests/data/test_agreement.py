@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from shapes import SHAPES
 from small import ONE, TWO, path, record, study
 
-from lcopa_bayes.bench.command import on_off, step
+from lcopa_bayes.bench.command import on_off, staircase, step
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
 from lcopa_bayes.data.drive import moved_with_drive
@@ -179,7 +179,24 @@ def test_noise_of_long_memory_is_no_response_ahead_of_its_drive() -> None:
     both = replace(one, response=np.column_stack([strong, weak]), response_axes=axes)
     assert disagreements((both,)) == ()
     alone = replace(both, response=weak[:, None], response_axes=axes[1:])
-    assert disagreements((alone,))  # nothing else says otherwise
+    assert disagreements((alone,)) == ()  # it rests where the later drive would move it
+    early = one.time < 5.0
+    assert disagreements((replace(alone, response=np.where(early, np.nan, weak)[:, None]),))
+    unrested = np.where(early[:, None], np.nan, both.response)
+    assert disagreements((replace(both, response=unrested),)) == ()
+
+
+@pytest.mark.parametrize("seed", [5, 9, 14])
+def test_a_response_that_rings_to_a_limit_is_not_ahead_of_its_drive(seed: int) -> None:
+    """No sum of lags follows it, and later drives follow it better by chance; but it rests before them."""
+    rng = np.random.default_rng(seed)
+    time, damping = rng.uniform(0.4, 1.5), rng.uniform(0.2, 0.5)
+    device = replace(ONE, paths=((path(2.0, 0.3, (time, 2 * damping * time), (2.0, 1.0)),),))
+    levels, hold, start = [*rng.uniform(-1, 1, 3), 0.0], rng.uniform(2, 5), rng.uniform(2, 4)
+    command = staircase(levels, hold=hold, start=start)
+    one = record(seed, device=device, command=command, duration=20.0, noise_sd=0.02)
+    limit = 0.6 * np.nanmax(np.abs(one.response))
+    assert disagreements((changed(one, np.clip(one.response, -limit, limit)),)) == ()
 
 
 @settings(max_examples=15, deadline=None)
