@@ -1,5 +1,5 @@
-"""What the base model needs before anything is missing: a drive before the first row where no record shows
-the plant at rest, and as many viscous terms as the records ask for."""
+"""What the base model needs before anything is missing: what a study does not state (`mendedstudy`), and as
+many viscous terms, elements and delays as the records ask for."""
 
 from __future__ import annotations
 
@@ -9,106 +9,26 @@ from functools import partial
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy.optimize import minimize
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.data.requirements import unmet_apart_from_rest, unmet_rest
-from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
+from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, exceeds_noise, too_smooth
+from lcopa_bayes.effectsearch.candidates import refitted
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import leading
+from lcopa_bayes.effectsearch.rounds import leading, named_of
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
-from lcopa_bayes.effectsearch.verdict import MARGIN
-from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
-
-_EVALUATIONS = 60
-_STEPS = 8
-"""Evaluations of the descent at each level tried [-]."""
-
-
-@final
-class Mended(NamedTuple):
-    """A study whose base model lost an assumption that its records contradict."""
-
-    study: Study
-    sentence: str
-    """What was changed."""
-    power: float = np.inf
-    """Squared residual that it leaves, where that was computed [response unit^2]."""
-
-
-def started(study: Study, fit: BaseFit) -> Mended | None:
-    """The study with one common drive before the first row of every record, when that is worth 3 nat.
-
-    Before its first row the plant rests under the first row's drive; a record that begins while the plant
-    moves would show the difference as a misfit of every slow effect at once. Where no record says or shows
-    what it rests under (an early row without a response, quiet samples) the level is tried: a single value
-    per drive, since records that each begin elsewhere would predict no other. Its own uncertainty is not
-    part of what follows. None where rest is known or the level brings nothing.
-    """
-    if fit.noise_known or any(np.isnan(one.response[0]).all() for one in study.fit):
-        return None
-    drive = np.concatenate([one.drive for one in study.fit])
-    low, high = drive.min(axis=0), drive.max(axis=0)
-    reach = high - low
-
-    def left(level: Vector) -> float:
-        return _power(_begun(study, level), fit)
-
-    first = np.mean([one.drive[0] for one in study.fit], axis=0)
-    ends = list(zip(low - reach, high + reach, strict=True))
-    best = minimize(left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2})
-    if not np.isfinite(best.fun):
-        return None
-    count = fit.optimum.effective
-    gain = 0.5 * count * np.log(fit.optimum.power / best.fun) - 0.5 * first.size * np.log(count)
-    if not gain > MARGIN:
-        return None
-    levels = " and ".join(
-        f"{value:.4g} {axis.unit} of {axis.name}"
-        for value, axis in zip(best.x, study.drive_axes, strict=True)
-    )
-    return Mended(
-        _begun(study, best.x),
-        "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
-        f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
-        "with a drive and no response would state it.",
-        float(best.fun),
-    )
-
-
-def _begun(study: Study, level: Vector) -> Study:
-    """All records with an early row of that drive and no response."""
-    return replace(
-        study,
-        fit=tuple(one.begun(level) for one in study.fit),
-        held_out=tuple(one.begun(level) for one in study.held_out),
-    )
-
-
-def _power(study: Study, fit: BaseFit) -> float:
-    """Squared residual of the base model from where it stood [response unit^2]; infinite where it fails."""
-    model = ExtendedModel(problem_of(study).posterior)
-    white = Whitening(model.plant.samples, fit.regression.whitening.noise)
-    regression = Regression(model, white)
-    try:
-        x, _ = regression.reached(fit.optimum.x, most=_STEPS, gain=0.1)
-        residual = white.observed - model.predict(x)
-    except ArithmeticError:
-        return np.inf
-    return float(residual @ residual)
-
 
 _MOST = 3
 _GAIN = 10.0
@@ -121,10 +41,6 @@ _COPIES = 6
 """Starts in which the terms that a smaller model lacks are added to its optimum [-]."""
 _BELOW = 0.5
 """Log likelihood by which a fit may stay below that of a model it contains [nat]."""
-_LONGER = 2.0
-"""Factor on the default prior of a delay that ends at it: 0.4 becomes 0.8 of the records' span [-]."""
-_AT_END = 1e-2
-"""Closer to the end of its prior than this share, a delay is at it [-]."""
 
 
 @final
@@ -153,9 +69,10 @@ def fitted_base(
 
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
-    than the best named effect, or more together with what it leaves to be named. InputError when a record
-    moves before its drive does, no drive before the first row explains that, and it is not a line that an
-    effect which goes on at rest may follow.
+    than the best named effect, or more together with what it leaves to be named. So it is where by itself it
+    is worth nothing and the plant leaves more than noise: a limit that clips a ringing response hides that it
+    rings. InputError when a record moves before its drive does, no drive before the first row explains that,
+    and it is not a line that an effect which goes on at rest may follow.
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
@@ -174,7 +91,7 @@ def fitted_base(
     else:
         study = replace(mended.study, model=study.model)
         base = based(study)._replace(sentence=mended.sentence)
-    later = _later(study, base.fit)
+    later = longer_delays(study, base.fit)
     if later is not None:
         study = later.study
         base = based(study)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
@@ -192,9 +109,15 @@ def fitted_base(
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
                 continue
-            base = _beside(base, wider)
-            break
-        if base.fit.failed:
+            hidden = _hidden(base, wider, library, [study.seed, 12, terms], draws, crew)
+            if hidden is None:
+                base = _beside(base, wider)
+                break
+            said = (
+                f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth more "
+                f"than {_GAIN:.0f} nat beside {hidden}, though nothing without it."
+            )
+        elif base.fit.failed:
             said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
@@ -328,9 +251,42 @@ def _named(
     base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
 ) -> Refit | None:
     """The best named effect beside a base fit."""
+    return _best(base, library, rng, draws, crew)[0]
+
+
+def _best(
+    base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
+) -> tuple[Refit | None, Refit | None]:
+    """The best effect beside a base fit that can be named, and the best of all that were refitted."""
     quiet = base.fit.noise_samples
     seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
-    return leading(base.start, seen, crew) if seen.alarmed else None
+    if not seen.alarmed:
+        return None, None
+    refits = refitted(base.start, seen, crew)[0]
+    every = (one for one in refits if not one.dynamics)
+    return named_of(refits, seen), next(every, None)
+
+
+def _hidden(
+    base: Base,
+    wider: Base,
+    library: Sequence[type[Effect]],
+    key: Sequence[int],
+    draws: int,
+    crew: Crew,
+) -> str | None:
+    """The effect beside which a wider model is worth more than a base model beside any, where this leaves
+    more than noise; None without one."""
+    if wider.fit.failed or not (base.fit.noise_known and base.fit.stands_out):
+        return None
+    rng = np.random.default_rng(key)
+    named, best = _best(base, library, rng, draws, crew)
+    if named is not None and not exceeds_noise(named.optimum):
+        return None
+    richer = _named(wider, library, rng, draws, crew)
+    if richer is None or not _gain(base, wider, best, richer) > _GAIN:
+        return None
+    return richer.added[0]
 
 
 def _explained(
@@ -342,25 +298,3 @@ def _explained(
     seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
     best = leading(base.start, seen, crew)
     return np.inf if best is None or too_smooth(best.optimum) else best.optimum.power
-
-
-def _later(study: Study, fit: BaseFit) -> Mended | None:
-    """The study with a longer default prior of its delays, where one is at the end of it; else None."""
-    model = fit.model
-    stuck = []
-    for position, k in enumerate(model.columns):
-        row = model.plant.table.rows[k]
-        late = fit.optimum.x[position] > (1 - _AT_END) * model.bounds[1][position]
-        if row.kind == "delay" and row.default and late and not row.log_scale:
-            stuck.append((row.name, row.domain[1]))
-    if not stuck:
-        return None
-    longer = {
-        name: PriorSettings(name, dist="uniform", parameters={"loc": 0.0, "scale": _LONGER * end})
-        for name, end in stuck
-    }
-    names = ", ".join(f"{name} (ends at {end:.4g} {study.time_unit})" for name, end in stuck)
-    return Mended(
-        replace(study, priors={**study.priors, **longer}),
-        f"The default prior of {names} is too short for these records and was doubled.",
-    )

@@ -185,8 +185,12 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
 
 def leading(start: State, seen: Trace, crew: Crew = ALONE) -> Refit | None:
     """The single named effect of most evidence that would be accepted; None without any."""
-    likely = accepted(refitted(start, seen, crew)[0], seen, seen.threshold)
-    return next((one for one in likely if not one.dynamics), None)
+    return named_of(refitted(start, seen, crew)[0], seen)
+
+
+def named_of(refits: Sequence[Refit], seen: Trace) -> Refit | None:
+    """The named effect of most evidence that may be kept, of refits by falling evidence; None without any."""
+    return next((one for one in accepted(refits, seen, seen.threshold) if not one.dynamics), None)
 
 
 def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
