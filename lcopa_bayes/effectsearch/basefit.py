@@ -70,7 +70,7 @@ class BaseFit:
             return True
         if not self.noise_known:
             return self.smooth
-        return exceeds_noise(self.optimum)
+        return 2.0 * self.optimum.cost > _OUT * self.optimum.residual.size
 
     @property
     def noise_samples(self) -> tuple[int, ...]:
@@ -182,11 +182,6 @@ def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observ
 
 def _alike(one: AxisNoise, other: AxisNoise) -> bool:
     return one.samples == other.samples and abs(one.law.sd / other.law.sd - 1) < 0.01
-
-
-def exceeds_noise(optimum: Optimum) -> bool:
-    """Whether a residual is more than noise that was measured apart from it."""
-    return 2.0 * optimum.cost > _OUT * optimum.residual.size
 
 
 def too_smooth(optimum: Optimum) -> bool:

@@ -13,15 +13,15 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.requirements import unmet_apart_from_rest, unmet_rest
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, exceeds_noise, too_smooth
-from lcopa_bayes.effectsearch.candidates import refitted
+from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
-from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor
+from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import leading, named_of
+from lcopa_bayes.effectsearch.rounds import Search, leading
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -52,7 +52,7 @@ class Base(NamedTuple):
     start: State
     sentence: str
     """What was changed; empty when nothing was."""
-    richer: tuple[State, ...] = ()
+    richer: tuple[Base, ...] = ()
     """Plants that contain it and were not chosen."""
 
 
@@ -69,10 +69,9 @@ def fitted_base(
 
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
-    than the best named effect, or more together with what it leaves to be named. So it is where by itself it
-    is worth nothing and the plant leaves more than noise: a limit that clips a ringing response hides that it
-    rings. InputError when a record moves before its drive does, no drive before the first row explains that,
-    and it is not a line that an effect which goes on at rest may follow.
+    than the best named effect, or more together with what it leaves to be named. InputError when a record
+    moves before its drive does, no drive before the first row explains that, and it is not a line that an
+    effect which goes on at rest may follow.
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
@@ -109,15 +108,9 @@ def fitted_base(
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
                 continue
-            hidden = _hidden(base, wider, library, [study.seed, 12, terms], draws, crew)
-            if hidden is None:
-                base = _beside(base, wider)
-                break
-            said = (
-                f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth more "
-                f"than {_GAIN:.0f} nat beside {hidden}, though nothing without it."
-            )
-        elif base.fit.failed:
+            base = _beside(base, wider)
+            break
+        if base.fit.failed:
             said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
@@ -133,6 +126,35 @@ def fitted_base(
             )
         base = wider._replace(sentence=f"{base.sentence} {said}".strip())
     return base
+
+
+def beside_effects(base: Base, searched: Search) -> Base | None:
+    """The richer base model that, with the effects of a search which leaves something, or with the best one
+    where it named none, is worth 10 nat more than the base model with them; None without any.
+
+    An effect may hide a term: a response that rings to a limit hardly rings.
+    """
+    chosen = searched.leading
+    if chosen is None or not searched.rounds[-1].alarmed:
+        return None
+    best, worth, sizes = None, _GAIN, chosen.model.sizes(chosen.optimum.x)
+    for wider in base.richer:
+        start = wider.start
+        try:
+            richer = refit(start.model, start.optimum, start.whitening, sizes, chosen.quiet)
+            gain = _gain(base, wider, chosen, richer)
+        except ArithmeticError:
+            continue
+        if gain > worth:
+            best, worth = wider, gain
+    if best is None:
+        return None
+    terms, before = (one.problem.study.model.terms for one in (best, base))
+    said = "Every path has an element and a delay of its own"
+    said = said if terms == before else f"The base model has {terms} viscous terms instead of {before}"
+    names = listed([effect.name for effect in chosen.model.effects])
+    said += f": beside {names} that is worth {worth:.0f} nat, though not without."
+    return best._replace(sentence=f"{base.sentence} {said}".strip())
 
 
 def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:
@@ -154,7 +176,7 @@ def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:
 
 def _beside(base: Base, wider: Base) -> Base:
     """A base fit with a wider one that it is preferred to, unless that has failed."""
-    return base if wider.fit.failed else base._replace(richer=(*base.richer, wider.start))
+    return base if wider.fit.failed else base._replace(richer=(*base.richer, wider))
 
 
 def _wider(study: Study, base: Base, terms: int, crew: Crew = ALONE) -> Base:
@@ -251,42 +273,9 @@ def _named(
     base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
 ) -> Refit | None:
     """The best named effect beside a base fit."""
-    return _best(base, library, rng, draws, crew)[0]
-
-
-def _best(
-    base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
-) -> tuple[Refit | None, Refit | None]:
-    """The best effect beside a base fit that can be named, and the best of all that were refitted."""
     quiet = base.fit.noise_samples
     seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
-    if not seen.alarmed:
-        return None, None
-    refits = refitted(base.start, seen, crew)[0]
-    every = (one for one in refits if not one.dynamics)
-    return named_of(refits, seen), next(every, None)
-
-
-def _hidden(
-    base: Base,
-    wider: Base,
-    library: Sequence[type[Effect]],
-    key: Sequence[int],
-    draws: int,
-    crew: Crew,
-) -> str | None:
-    """The effect beside which a wider model is worth more than a base model beside any, where this leaves
-    more than noise; None without one."""
-    if wider.fit.failed or not (base.fit.noise_known and base.fit.stands_out):
-        return None
-    rng = np.random.default_rng(key)
-    named, best = _best(base, library, rng, draws, crew)
-    if named is not None and not exceeds_noise(named.optimum):
-        return None
-    richer = _named(wider, library, rng, draws, crew)
-    if richer is None or not _gain(base, wider, best, richer) > _GAIN:
-        return None
-    return richer.added[0]
+    return leading(base.start, seen, crew) if seen.alarmed else None
 
 
 def _explained(

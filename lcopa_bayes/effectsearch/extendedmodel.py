@@ -106,6 +106,12 @@ class ExtendedModel:
         wider = [self.wider.get(effect.name, 1.0) for effect in self.effects]
         return np.array([one.coefficient.scale * wider[one.effect] for one in self.effected.coefficients])
 
+    def sizes(self, x: Vector) -> tuple[tuple[Effect, Vector], ...]:
+        """The effects, each with its coefficients at coordinates over their prior sd [-]."""
+        psi, placed = x[self.plant_size :] / self.scale, self.effected.coefficients
+        owners = np.array([one.effect for one in placed], dtype=int)
+        return tuple((effect, psi[owners == e]) for e, effect in enumerate(self.effects))
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates, as in the table."""

@@ -20,7 +20,7 @@ from lcopa_bayes.data.requirements import not_at_rest
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
-from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
+from lcopa_bayes.effectsearch.basemodel import Base, beside_effects, fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.findings import Side, astray, findings_of, named_effects
@@ -222,30 +222,36 @@ def _looped(
     draws = 1000 if quick else 2000
     chosen = structure_chosen(study, as_stated=as_stated)
     based = partial(fitted_base, as_stated=as_stated, draws=draws, crew=crew)
-    problem, base, start, enlarged, wider = based(study, kinds)
-    outliers = outlying(study, base)
+    base = based(study, kinds)
+    outliers = outlying(study, base.fit)
     if outliers is not None:
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
         crew.stage("fitting the plant again, without outlying samples")
-        problem, base, start, enlarged, wider = based(study, kinds)
-    before = Side.of(problem, start)
+        base = based(study, kinds)
+    before = Side.of(base.problem, base.start)
     crew.stage(f"without effects {before.said}; looking for what is missing")
     contrary = disagreements((*study.fit, *study.held_out), crew)
-    drifting = (one.as_drift for one in not_at_rest(problem.study.fit, problem.study.held_out))
-    cautions = (*map(str, contrary), *drifting, *base.caution, *single_record(study))
+    drifting = (one.as_drift for one in not_at_rest(base.problem.study.fit, base.problem.study.held_out))
+    cautions = (*map(str, contrary), *drifting, *base.fit.caution, *single_record(study))
     alone = len(study.fit) == 1 and not study.held_out
-    searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
-    if not wrong or (base.smooth and wrong == base.failed):
+    searched, wrong = None, next((str(one) for one in contrary if one.gross), base.fit.failed)
+    if not wrong or (base.fit.smooth and wrong == base.fit.failed):
         rng = np.random.default_rng([study.seed, 11])
         rounds = partial(search, library=kinds, rng=rng, draws=draws, alone=alone, crew=crew)
-        searched = _searched(start, base, rounds)
+        searched = _searched(base, rounds)
+        richer = beside_effects(base, searched) if chosen else None
+        if richer is not None:
+            crew.stage("fitting a richer plant, which shows beside what is missing")
+            base, before = richer, Side.of(richer.problem, richer.start)
+            searched = _searched(base, rounds)
+    problem, fit = base.problem, base.fit
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if searched is None or (wrong and too_smooth(searched.state.optimum)):
-        seen = missed(study, before.fit, before.unseen, start)
+        seen = missed(study, before.fit, before.unseen, base.start)
         but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
         verdict = Verdict("unexplained", "tentative", f"No effect is named, because {wrong}.{but}")
         return Loop(
-            *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
+            *(problem, fit, base.sentence, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
             contrary=contrary,
         )
@@ -254,13 +260,14 @@ def _looped(
     crew.stage(f"with {added} {reached.said}; holding other plants against it")
     lags = lags_of(searched.state, problem) if chosen else ()
     chance = searched.rounds[0].trace.threshold
-    dynamics = linear_dynamics(searched.state, lags, base.noise_samples, chance)
+    dynamics = linear_dynamics(searched.state, lags, fit.noise_samples, chance)
     if dynamics is None and chosen:
         dynamics = integer_dynamics(searched.state, problem)
     findings = findings_of(
         study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone
     )
-    extended, others = searched.state.model.effects, wider if chosen else None
+    extended = searched.state.model.effects
+    others = tuple(one.start for one in base.richer) if chosen else None
     plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others)
     lags = plants.held_against(lags, searched.state, problem)
     preferred = any(one.support == "lags" for one in lags)
@@ -296,21 +303,32 @@ def _looped(
         plants = PlantsBeside.of(state, problem, others)
         lags = plants.held_against(lags, state, problem)
     return Loop(
-        *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
-        *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, lags, plants),
+        *(problem, fit, base.sentence, searched.rounds, state.model.effects),
+        groups=searched.groups if named else (),
+        verdict=verdict,
+        before=before,
+        after=after,
+        left_out=not study.held_out,
+        cautions=cautions,
+        draws=sampled[0] if sampled is not None else None,
+        outliers=outliers,
+        contrary=contrary,
+        open=found,
+        lags=lags,
+        plants=plants,
     )
 
 
-def _searched(start: State, base: BaseFit, rounds: Callable[..., Search]) -> Search:
+def _searched(base: Base, rounds: Callable[..., Search]) -> Search:
     """Rounds under the noise that was measured; where too few samples at rest measured it and nothing stands
     out, again under noise known from the residual alone."""
-    found = rounds(start, noise_samples=base.noise_samples)
-    if base.noise_known and not found.rounds[-1].trace.alarmed:
+    noise = base.fit.noise
+    found = rounds(base.start, noise_samples=base.fit.noise_samples)
+    if base.fit.noise_known and not found.rounds[-1].trace.alarmed:
         found = found.settled
-        if not all(one.firm for one in base.noise) and not found.state.model.effects:
+        if not all(one.firm for one in noise) and not found.state.model.effects:
             # too few samples at rest leave noise plausible in which every effect drowns
-            found = rounds(found.state, noise_samples=(0,) * len(base.noise)).settled
+            found = rounds(found.state, noise_samples=(0,) * len(noise)).settled
     return replace(found, state=released(found.state))
 
 

@@ -98,6 +98,12 @@ class Search:
         return self.brought >= FIRM and alone and not self.rounds[-1].trace.alarmed
 
     @property
+    def leading(self) -> Refit | None:
+        """The refit that was added last, or where none was the best one with a name; None without any."""
+        added = (one.chosen for one in reversed(self.rounds) if one.chosen is not None)
+        return next(added, next((one for one in self.rounds[0].refits if not one.dynamics), None))
+
+    @property
     def settled(self) -> Self:
         """The same under the noise that its residual has, unless something stands out from the noise."""
         if self.rounds[-1].trace.alarmed:
@@ -185,12 +191,8 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
 
 def leading(start: State, seen: Trace, crew: Crew = ALONE) -> Refit | None:
     """The single named effect of most evidence that would be accepted; None without any."""
-    return named_of(refitted(start, seen, crew)[0], seen)
-
-
-def named_of(refits: Sequence[Refit], seen: Trace) -> Refit | None:
-    """The named effect of most evidence that may be kept, of refits by falling evidence; None without any."""
-    return next((one for one in accepted(refits, seen, seen.threshold) if not one.dynamics), None)
+    likely = accepted(refitted(start, seen, crew)[0], seen, seen.threshold)
+    return next((one for one in likely if not one.dynamics), None)
 
 
 def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
@@ -227,12 +229,8 @@ def _remains(linear: Refit, candidate: Refit) -> bool:
     if candidate.log_bayes_factor - linear.log_bayes_factor > MARGIN * (1 + len(linear.new)):
         return True
     kept = {e.name for e in linear.model.effects}
-    first = candidate.model.plant_size
-    added = []
-    for effect in candidate.model.effects:
-        if effect.name not in kept:
-            where = np.array(candidate.places(effect.name))
-            added.append((effect, candidate.optimum.x[where] / candidate.model.scale[where - first]))
+    sizes = candidate.model.sizes(candidate.optimum.x)
+    added = [(effect, size) for effect, size in sizes if effect.name not in kept]
     try:
         both = refit(linear.model, linear.optimum, linear.whitening, added, linear.quiet)
     except ArithmeticError:
