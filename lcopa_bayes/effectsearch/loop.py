@@ -241,7 +241,7 @@ def _looped(
         searched = _searched(base, rounds)
         richer = beside_effects(base, searched) if chosen else None
         if richer is not None:
-            crew.stage("fitting a richer plant, which shows beside what is missing")
+            crew.stage("searching again with a richer plant")
             base, before = richer, Side.of(richer.problem, richer.start)
             searched = _searched(base, rounds)
     problem, fit = base.problem, base.fit
