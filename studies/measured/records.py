@@ -1,4 +1,4 @@
-"""What `fit`, `loop` and `compare` say of every measured record: one table.
+"""What `fit`, `loop` and `compare` say of every measured record: one table of all verbs, or of some of them.
 
     python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--verbs VERB ...] [--jobs N]
         [--limit SECONDS] [--out FOLDER]
@@ -13,7 +13,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,9 +30,17 @@ from lcopa_bayes.verbs.loop import loop
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", "../shared")) / "records"
 VERBS = ("fit", "loop", "compare")
-HEADS: tuple[str, ...] = ("record", "structure", "grade", "sums of lags", "held out, RMSE", "fit [CPU s]")
-HEADS += ("loop", "names", "held out / noise", "loop [CPU s]")
-HEADS += ("preferred", "fractional orders", "compare [CPU s]")
+HEADS = {
+    "fit": ("structure", "grade", "sums of lags", "held out, RMSE", "fit [CPU s]"),
+    "loop": ("loop", "names", "held out / noise", "loop [CPU s]"),
+    "compare": ("preferred", "fractional orders", "compare [CPU s]"),
+}
+"""Columns of each verb."""
+ERRORS = (
+    "Held-out errors are root mean squares, of the fit in the unit of the record, of the loop over the",
+    "noise of the fit, before and after.",
+    "",
+)
 QUICK, BUDGET = ("silverbox", "cd_player_arm"), 300.0
 """Records of many samples, whose sampling ends after so long [s], and whose loop and candidates take fewer
 steps."""
@@ -109,20 +117,14 @@ def perform(folder: str, verb: str, limit: int) -> dict[str, Any]:
     return row | {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
 
 
-def page(rows: list[dict[str, Any]]) -> str:
-    """The table in Markdown, one line per record."""
-    lines = [
-        "# Measured records",
-        "",
-        "Held-out errors are root mean squares, of the fit in the unit of the record, of the loop over the",
-        "noise of the fit, before and after.",
-        "",
-        f"| {' | '.join(HEADS)} |",
-        f"|{'---|' * len(HEADS)}",
-    ]
+def page(rows: list[dict[str, Any]], verbs: Sequence[str]) -> str:
+    """The table of some verbs in Markdown, one line per record."""
+    heads = ["record", *(head for verb in verbs for head in HEADS[verb])]
+    lines = ["# Measured records", "", *(() if verbs == ["compare"] else ERRORS)]
+    lines += [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
     for name in dict.fromkeys(row["record"] for row in rows):
         own = {row["verb"]: row for row in rows if row["record"] == name}
-        cells = [_cells(own.get(verb), width, said) for verb, (width, said) in CELLS.items()]
+        cells = [_cells(own.get(verb), *CELLS[verb]) for verb in verbs]
         lines.append(f"| {' | '.join([name, *cells])} |")
     return "\n".join([*lines, ""])
 
@@ -197,7 +199,9 @@ def main() -> None:
             write_text(kept / f"{row['record']}.{row['verb']}.json", f"{text}\n")
             print(f"{row['record']} {row['verb']}: {row['cpu_seconds']:.0f} s", flush=True)
     rows = [done[task] for task in tasks if task in done]
-    write_text(options.out / "report.md", page(rows))
+    verbs = [verb for verb in VERBS if verb in options.verbs]
+    name = "report" if len(verbs) == len(VERBS) else "-".join(verbs)
+    write_text(options.out / f"{name}.md", page(rows, verbs))
 
 
 if __name__ == "__main__":
