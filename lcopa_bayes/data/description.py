@@ -42,6 +42,7 @@ _EXACT = 1e-12
 """Least variance of noise, over the square of the response's range [-]."""
 
 
+@final
 class Followed(NamedTuple):
     """How a description follows a response axis."""
 

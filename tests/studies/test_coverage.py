@@ -80,12 +80,15 @@ def test_a_record_without_a_row_or_refused_says_so() -> None:
     orders = {"verdict": "warranted", "log_bayes_factor": 22.04, "integer": "second-order"}
     weighed = {"record": "a", "verb": "compare", "preferred": None, "fractional": orders, "cpu_seconds": 9.0}
     refused = {"record": "b", "verb": "fit", "refused": "no drive", "cpu_seconds": 0.1}
-    text = records.page([fitted, weighed, refused])
+    text = records.page([fitted, weighed, refused], records.VERBS)
     assert "| a | 1 term | reliable | both | t 0.0512 K | 3 | not run |" in text
     assert "| none | warranted, +22.0 nat against second-order | 9 |" in text
     assert "| b | no drive |" in text
     lengths = {line.count("|") for line in text.splitlines() if line.startswith("| ")}
-    assert lengths == {1 + len(records.HEADS)}
+    assert lengths == {2 + sum(map(len, records.HEADS.values()))}
+    alone = records.page([weighed], ["compare"])
+    assert "| a | none | warranted, +22.0 nat against second-order | 9 |" in alone
+    assert "root mean squares" not in alone
 
 
 def test_a_row_that_does_not_end_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -97,6 +100,6 @@ def test_a_row_that_does_not_end_says_so(monkeypatch: pytest.MonkeyPatch, tmp_pa
     row = records.perform(str(tmp_path / "tank"), "loop", 1)
     assert row["refused"] == "did not end in 1 s"
     assert row["seconds"] < 10.0
-    assert "| did not end in 1 s |" in records.page([row])
+    assert "| did not end in 1 s |" in records.page([row], ["loop"])
     monkeypatch.setitem(records.ACTIONS, "loop", lambda _: {"verdict": "clean"})
     assert records.perform(str(tmp_path / "tank"), "loop", 1)["verdict"] == "clean"
