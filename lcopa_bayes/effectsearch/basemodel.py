@@ -134,7 +134,7 @@ def beside_effects(base: Base, searched: Search) -> Base | None:
 
     An effect may hide a term: a response that rings to a limit hardly rings.
     """
-    chosen = searched.leading
+    chosen = searched.best
     if chosen is None or not searched.rounds[-1].alarmed:
         return None
     best, worth, sizes = None, _GAIN, chosen.model.sizes(chosen.optimum.x)

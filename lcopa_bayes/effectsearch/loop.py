@@ -322,13 +322,13 @@ def _looped(
 def _searched(base: Base, rounds: Callable[..., Search]) -> Search:
     """Rounds under the noise that was measured; where too few samples at rest measured it and nothing stands
     out, again under noise known from the residual alone."""
-    noise = base.fit.noise
-    found = rounds(base.start, noise_samples=base.fit.noise_samples)
-    if base.fit.noise_known and not found.rounds[-1].trace.alarmed:
+    fit = base.fit
+    found = rounds(base.start, noise_samples=fit.noise_samples)
+    if fit.noise_known and not found.rounds[-1].trace.alarmed:
         found = found.settled
-        if not all(one.firm for one in noise) and not found.state.model.effects:
+        if not all(one.firm for one in fit.noise) and not found.state.model.effects:
             # too few samples at rest leave noise plausible in which every effect drowns
-            found = rounds(found.state, noise_samples=(0,) * len(noise)).settled
+            found = rounds(found.state, noise_samples=(0,) * len(fit.noise)).settled
     return replace(found, state=released(found.state))
 
 

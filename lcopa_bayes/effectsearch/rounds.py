@@ -98,7 +98,7 @@ class Search:
         return self.brought >= FIRM and alone and not self.rounds[-1].trace.alarmed
 
     @property
-    def leading(self) -> Refit | None:
+    def best(self) -> Refit | None:
         """The refit that was added last, or where none was the best one with a name; None without any."""
         added = (one.chosen for one in reversed(self.rounds) if one.chosen is not None)
         return next(added, next((one for one in self.rounds[0].refits if not one.dynamics), None))

@@ -207,7 +207,7 @@ def fit(
         problem, begun = weighted_start(problem, quick=quick)
         begin = monotonic()
         weighted_result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=begun)
-        if plan.seconds is not None:  # ensembles have what is left
+        if weighted_result is None and plan.seconds is not None:  # ensembles have what is left
             plan = replace(plan, seconds=max(begin + plan.seconds - monotonic(), 0.0))
     else:
         problem, optima = resolved_optima(problem, searched[1] if searched else optima_of(problem))
