@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -14,7 +14,7 @@ from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import Circle
-from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.grid import Lattice, Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response
 from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
@@ -115,7 +115,9 @@ class Experiment:
     @cached_property
     def phases(self) -> tuple[tuple[Phase, ...], ...]:
         """Changes of every drive by phase; none for a drive that never moves."""
-        return tuple(phases(drive, self.mesh.lattice.step) if drive.moves else () for drive in self.drives)
+        lattice = self.mesh.lattice
+        apart = partial(phases, step=lattice.step, even=lattice.slots is not None)
+        return tuple(apart(drive) if drive.moves else () for drive in self.drives)
 
     @cached_property
     def blocks(self) -> int:
@@ -192,23 +194,41 @@ class ForwardModel:
         """Write the unit responses of a few plants into `out`."""
         read: dict[tuple[int, int, int, int], Array] = {}
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
-        for number, (experiment, target) in enumerate(zip(self.experiments, out, strict=True)):
-            lattice, first = experiment.mesh.lattice, experiment.mesh.reading.first
-            for index, (element, delay, axis) in enumerate(self.layout.units):
-                if not experiment.phases[axis]:
+        for index, (element, delay, axis) in enumerate(self.layout.units):
+            proportional: list[tuple[int, float, Array]] = []
+            for step, moved in self._moved(axis).items():
+                own = []
+                for number in moved:
+                    place, place_axis, scale = self._alike[number][axis]
+                    same = (element, delay, place, place_axis)
+                    if same in read:
+                        proportional.append((number, scale, read[same]))
+                        continue
+                    own.append(number)
+                    if scale == 1.0:
+                        read[same] = out[number][index]
+                if not own:
                     continue
-                place, place_axis, scale = self._alike[number][axis]
-                same = (element, delay, place, place_axis)
-                if same in read:
-                    np.multiply(scale, read[same], out=target[index])
-                    continue
-                response = self._step_response(dynamics, element, lattice.step, known)
-                late = dynamics.delays[:, delay]
-                target[index][:, first:] = superposed[lattice.step](
-                    response, experiment.phases[axis], lattice, late, (element, delay)
-                )[0]
-                if scale == 1.0:
-                    read[same] = target[index]
+                response = self._step_response(dynamics, element, step, known)
+                late, records = dynamics.delays[:, delay], self._driven(own, axis)
+                found = superposed[step](response, records, late, (element, delay))
+                for number, (value,) in zip(own, found, strict=True):
+                    out[number][index][:, self.experiments[number].mesh.reading.first :] = value
+            for number, scale, one in proportional:
+                np.multiply(scale, one, out=out[number][index])
+
+    def _moved(self, axis: int) -> dict[float, list[int]]:
+        """Records in which a drive moves, by the width of their blocks."""
+        moved: dict[float, list[int]] = {}
+        for number, experiment in enumerate(self.experiments):
+            if experiment.phases[axis]:
+                moved.setdefault(experiment.mesh.lattice.step, []).append(number)
+        return moved
+
+    def _driven(self, records: Sequence[int], axis: int) -> list[tuple[tuple[Phase, ...], Lattice]]:
+        """Changes of a drive in some records, and where their samples lie."""
+        some = (self.experiments[number] for number in records)
+        return [(one.phases[axis], one.mesh.lattice) for one in some]
 
     def _step_response(
         self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: Slopes = None
@@ -278,28 +298,26 @@ class ForwardModel:
         wanted: Slopes = "all" if in_orders else "times"
         known = {} if known is None else known
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
-        out = []
-        for experiment in self.experiments:
-            lattice, reading = experiment.mesh.lattice, experiment.mesh.reading
-            value = np.zeros((len(self.layout.units), dynamics.batch, reading.samples))
-            slopes = []
-            for index, (element, delay, axis) in enumerate(self.layout.units):
-                terms = dynamics.times[element].shape[1]
-                slopes.append(np.zeros((2 * terms + 1, dynamics.batch, reading.samples)))
-                if not experiment.phases[axis]:
-                    continue
-                response = self._step_response(dynamics, element, lattice.step, known, slopes=wanted)
-                superpose, changes = superposed[lattice.step], experiment.phases[axis]
-                late, key = dynamics.delays[:, delay], (element, delay)
-                rows = superpose(response, changes, lattice, late, key)
-                value[index][:, reading.first :] = rows[0]
-                slopes[index][: rows.shape[0] - 1, :, reading.first :] = rows[1:]
-                if not in_orders:
-                    slopes[index][terms:-1] = np.nan
-                by_block = superpose(response.alone, changes, lattice, late, key, "slope")
-                slopes[index][-1:, :, reading.first :] = -by_block / lattice.step
-            out.append((value, slopes))
-        return out
+        batch, sizes = dynamics.batch, [e.mesh.reading.samples for e in self.experiments]
+        values = [np.zeros((len(self.layout.units), batch, size)) for size in sizes]
+        slopes: list[list[Array]] = [[] for _ in sizes]
+        for index, (element, delay, axis) in enumerate(self.layout.units):
+            terms = dynamics.times[element].shape[1]
+            for own, size in zip(slopes, sizes, strict=True):
+                own.append(np.zeros((2 * terms + 1, batch, size)))
+            for step, moved in self._moved(axis).items():
+                response = self._step_response(dynamics, element, step, known, slopes=wanted)
+                records, late = self._driven(moved, axis), dynamics.delays[:, delay]
+                superpose = partial(superposed[step], records=records, delays=late, key=(element, delay))
+                found, by_block = superpose(response), superpose(response.alone, kind="slope")
+                for number, rows, slope in zip(moved, found, by_block, strict=True):
+                    first, target = self.experiments[number].mesh.reading.first, slopes[number][index]
+                    values[number][index][:, first:] = rows[0]
+                    target[: len(rows) - 1, :, first:] = rows[1:]
+                    target[-1:, :, first:] = -slope / step
+                    if not in_orders:
+                        target[terms:-1] = np.nan
+        return list(zip(values, slopes, strict=True))
 
 
 def deflections(layout: Layout, rest: Vector, gains: Array, units: Array) -> Array:

@@ -31,25 +31,25 @@ _RATIO = 4
 """Blocks of a level in one block of the next coarser level."""
 _LEVELS = 3
 """Levels finer than the blocks of the whole response."""
-_NEAR = 8
+NEAR = 8
 """Blocks after the onset that are read from finer levels."""
-_FINE = _RATIO * _NEAR + 4
+_FINE = _RATIO * NEAR + 4
 """Blocks of a finer level: what the coarser one hands over, and the neighbours that reading needs."""
 _POWER = 2.5
 """Blocks of the finest level below which the response is taken as its leading power of time."""
-_SIDE = 2
+SIDE = 2
 """Blocks on either side of the one that is read."""
 
 
 def _tap_polynomials() -> Matrix:
     """Integral from the left edge of a block to theta within it, per mean of the blocks around it.
 
-    Row l holds the coefficients, in rising powers of theta, that belong to the mean of block l - _SIDE: the
+    Row l holds the coefficients, in rising powers of theta, that belong to the mean of block l - SIDE: the
     polynomial through the running integral at the six edges around.
     """
-    edges = np.arange(-_SIDE, _SIDE + 2, dtype=float)
+    edges = np.arange(-SIDE, SIDE + 2, dtype=float)
     rows = []
-    for block in range(-_SIDE, _SIDE + 1):
+    for block in range(-SIDE, SIDE + 1):
         area = np.where(edges > block, 1.0, 0.0) - (1.0 if block < 0 else 0.0)
         rows.append(np.linalg.solve(np.vander(edges, increasing=True), area))
     return np.array(rows)
@@ -111,16 +111,16 @@ class StepResponse:
 
         Parameters: theta (places, batch) in [0, 1) [blocks], one column for each element.
         """
-        n = self.coarse.shape[2] - _SIDE
+        n = self.coarse.shape[2] - SIDE
         out = np.zeros((self.coarse.shape[0], *theta.shape, n))
-        inner = out[..., _SIDE:]
-        around = sliding_window_view(self.coarse[:, None], 2 * _SIDE + 1, axis=3)
+        inner = out[..., SIDE:]
+        around = sliding_window_view(self.coarse[:, None], 2 * SIDE + 1, axis=3)
         weights = np.moveaxis(taps(theta, kind), 0, -1)[..., None]
         np.matmul(around, weights, out=inner[..., None])
         if kind == "integral":
-            inner += self._sums[:, None, :, _SIDE:n]
-        first = min(_NEAR, n)
-        out[..., :first] = self._near(theta[..., None] + np.arange(first), kind)
+            inner += self._sums[:, None, :, SIDE:n]
+        first = min(NEAR, n)
+        out[..., :first] = self.near(theta[..., None] + np.arange(first), kind)
         return out
 
     def at(self, x: Matrix, kind: Kind = "value") -> Array:
@@ -136,17 +136,17 @@ class StepResponse:
         first = int(np.argmax(begun))
         x, after, inner = x[:, first:], after[:, first:], out[:, :, first:]
         n = self.coarse.shape[2]
-        block = np.clip(np.floor(x).astype(int), _SIDE, n - _SIDE - 1)
+        block = np.clip(np.floor(x).astype(int), SIDE, n - SIDE - 1)
         weights = taps(x - block, kind)
         flat, place = self.coarse.reshape(len(out), -1), block + n * np.arange(len(x))[:, None]
-        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
+        for weight, shift in zip(weights, range(-SIDE, SIDE + 1), strict=True):
             inner += weight * flat.take(place + shift, axis=1)
         if kind == "integral":
             inner += self._sums.reshape(len(out), -1).take(place, axis=1)
         inner *= after
         if self.fine.shape[1] == 0:
             return out
-        near = (after & (x < _NEAR)).nonzero()
+        near = (after & (x < NEAR)).nonzero()
         inner[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
         return out
 
@@ -170,21 +170,21 @@ class StepResponse:
         """Other responses of these elements, as block means alone, (rows, batch, n)."""
         return replace(self, coarse=means, fine=self.fine[:, :0])
 
-    def _near(self, x: Array, kind: Kind) -> Array:
-        """Readings at positions below _NEAR, (places, batch, positions) -> (rows, *x.shape)."""
+    def near(self, x: Array, kind: Kind) -> Array:
+        """Readings at positions below NEAR, (places, batch, positions) -> (rows, *x.shape)."""
         elements = np.broadcast_to(np.arange(x.shape[1])[:, None], x.shape)
         return self._read_fine(elements.ravel(), x.ravel(), kind).reshape(-1, *x.shape)
 
     def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
-        """Readings of single elements at positions below _NEAR, (rows, positions)."""
-        level = np.clip(np.floor(np.log(_NEAR / np.maximum(x, 1e-9)) / np.log(_RATIO)), 0, _LEVELS - 1)
+        """Readings of single elements at positions below NEAR, (rows, positions)."""
+        level = np.clip(np.floor(np.log(NEAR / np.maximum(x, 1e-9)) / np.log(_RATIO)), 0, _LEVELS - 1)
         level = level.astype(int)
         width = _RATIO ** -(level + 1.0)
         position = x / width
         power = position < _POWER
         place = np.where(power, _POWER, position)
-        block = np.minimum(np.floor(place).astype(int), _FINE - _SIDE - 1)
-        around = sliding_window_view(self.fine, 2 * _SIDE + 1, axis=3)[:, level, element, block - _SIDE]
+        block = np.minimum(np.floor(place).astype(int), _FINE - SIDE - 1)
+        around = sliding_window_view(self.fine, 2 * SIDE + 1, axis=3)[:, level, element, block - SIDE]
         values = np.asarray(
             np.matmul(around[:, :, None], taps(place - block, kind).T[:, :, None])[:, :, 0, 0]
         )
@@ -205,7 +205,7 @@ class StepResponse:
         base = np.where(after, position, _POWER) / _POWER
         block = int(_POWER)
         weights = taps(np.array([_POWER - block]), "value")[:, 0]
-        means = self.fine[:, -1, element, block - _SIDE : block + _SIDE + 1]
+        means = self.fine[:, -1, element, block - SIDE : block + SIDE + 1]
         edge = np.einsum("rpl,l->rp", means, weights)
         order = self.orders[element]
         width = float(_RATIO) ** -_LEVELS
@@ -254,7 +254,7 @@ def step_response(
 
 def _hand_over(narrow: Array, wide: Array) -> None:
     """Replace the first block means by those of the narrower blocks in them."""
-    count = min(_NEAR, wide.shape[-1])
+    count = min(NEAR, wide.shape[-1])
     parts = narrow[..., : _RATIO * count].reshape(*narrow.shape[:-1], count, _RATIO)
     wide[..., :count] = parts.mean(axis=-1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil
 from typing import final
 
@@ -13,6 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.blockpulses import Circle, Spectrum
+from lcopa_bayes.model.changetrain import Train, plain_spectrum, superposed
 from lcopa_bayes.model.grid import Lattice
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
 
@@ -22,9 +24,9 @@ _SAME_PHASE = 1e-7
 """Changes whose distance deviates from whole blocks by less than this share a phase [blocks]."""
 _ROUNDED = 1e-4
 """The same where there are too many phases: time stamps may have been rounded [blocks]."""
-_PHASES = 24
-"""Phases of a drive that are kept apart; further changes off the lattice are shared out between the two
-blocks around them, as block means of the drive would be."""
+_PHASES, _MANY = 24, 512
+"""Phases of a drive that are kept apart, and those where samples are equidistant; further changes off the
+lattice are shared out between the two blocks around them, as block means of the drive would be."""
 _SHARED = 0.5
 """Share of all changes of a drive beyond which none are kept apart [-]."""
 _PLACES = round(1.0 / _SAME_PHASE)
@@ -34,6 +36,9 @@ _KEPT = 1 << 16
 """Blocks up to which the spectrum of a phase is kept: those of 24 phases are no more than 25 MB."""
 _HELD = 1 << 19
 """Numbers read of the step response of a single plant that are kept for other commands: 4 MB."""
+_APART = 2
+"""Places of the samples in a block after phases of few changes up to which each is read by itself [-]; more
+are convolved together."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -65,8 +70,9 @@ class Phase:
         return spectrum
 
 
-def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
-    """The changes of a drive by phase on blocks of width `step` [time unit].
+def phases(drive: AxisDrive, step: float, *, even: bool = False) -> tuple[Phase, ...]:
+    """The changes of a drive by phase on blocks of width `step` [time unit], read at samples that are `even`
+    where they are equidistant.
 
     Of more phases than are kept apart those of the largest changes are, and the rest are shared out: small
     changes that an effect adds to the commands leave the response to these as it is, or its derivative would
@@ -75,7 +81,8 @@ def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
     jumps = drive.jumps
     place = (drive.times - drive.times[0]) / step
     for tolerance in (_SAME_PHASE, _ROUNDED):
-        groups, rest = _alike(place, np.argsort(-np.abs(jumps), kind="stable"), tolerance)
+        sequence = np.argsort(-np.abs(jumps), kind="stable")
+        groups, rest = _alike(place, sequence, tolerance, _MANY if even else _PHASES)
         if not rest.size:
             break
     if np.abs(jumps[rest]).sum() > _SHARED * np.abs(jumps).sum():
@@ -100,12 +107,12 @@ def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
     return tuple(out)
 
 
-def _alike(place: Vector, sequence: Index, tolerance: float) -> tuple[list[Index], Index]:
-    """Positions by phase, at most _PHASES of them, phases in the order of `sequence`, and what is left."""
+def _alike(place: Vector, sequence: Index, tolerance: float, most: int) -> tuple[list[Index], Index]:
+    """Positions by phase, at most so many of them, phases in the order of `sequence`, and what is left."""
     beyond = place - np.round(place)
     groups: list[Index] = []
     rest = sequence
-    while rest.size and len(groups) < _PHASES:
+    while rest.size and len(groups) < most:
         apart = np.abs(beyond[rest] - beyond[rest[0]])
         same = np.minimum(apart, 1.0 - apart) < tolerance
         groups.append(rest[same])
@@ -161,34 +168,77 @@ class Superposition:
     """Of the step responses' blocks."""
     kept: dict[tuple[object, ...], _Read] = field(default_factory=dict)
     """Readings by what they are of and by the place of the samples in a block."""
+    spectra: dict[int, Spectrum] = field(default_factory=dict)
+    """Transforms of block means by element."""
 
     def __call__(
         self,
         response: StepResponse,
-        changes: Sequence[Phase],
-        lattice: Lattice,
+        records: Sequence[tuple[Sequence[Phase], Lattice]],
         delays: Vector,
         key: tuple[int, int],
         kind: Kind = "value",
-    ) -> Array:
-        """Readings of `response` under the delayed changes, (rows, batch, samples) [drive unit].
+    ) -> list[Array]:
+        """Readings of `response` under the delayed changes of each record, (rows, batch, samples) [drive
+        unit].
 
         Parameters: delays (batch,) [time unit]; key: element and delay slot, the same for the same
         `response` and `delays`; kind "slope" reads the derivative per block instead.
         """
-        out = np.zeros((*response.coarse.shape[:2], lattice.times.size))
-        if not lattice.times.size:
-            return out
-        if lattice.slots is None:
-            self._add_anywhere(out, response, changes, lattice, delays, kind)
-            return out
-        begins = np.array([phase.time for phase in changes])
-        origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
-        for phase, origin, read in zip(
-            changes, origins, self._reads(response, origins, lattice, key, kind), strict=True
-        ):
-            self._add_on_lattice(out, phase, origin, read, lattice)
+        shape = response.coarse.shape[:2]
+        out = [np.zeros((*shape, lattice.times.size)) for _, lattice in records]
+        scattered: list[tuple[Array, Sequence[Phase], Lattice]] = []
+        apart = _places(records) > _APART
+        for target, (changes, lattice) in zip(out, records, strict=True):
+            if not lattice.times.size:
+                continue
+            if lattice.slots is None:
+                self._add_anywhere(target, response, changes, lattice, delays, kind)
+                continue
+            few = [phase for phase in changes if apart and phase.blocks.size <= _ADDED]
+            if few:
+                scattered.append((target, few, lattice))
+                changes = [phase for phase in changes if phase.blocks.size > _ADDED]
+            begins = np.array([phase.time for phase in changes])
+            origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
+            for phase, origin, read in zip(
+                changes, origins, self._reads(response, origins, lattice, key, kind), strict=True
+            ):
+                self._add_on_lattice(target, phase, origin, read, lattice)
+        together = max(1, _TOGETHER // (self.circle.n * shape[0] * shape[1]))
+        for begin in range(0, len(scattered), together):
+            self._add_scattered(scattered[begin : begin + together], response, delays, key[0], kind)
         return out
+
+    def _add_scattered(
+        self,
+        records: Sequence[tuple[Array, Sequence[Phase], Lattice]],
+        response: StepResponse,
+        delays: Vector,
+        element: int,
+        kind: Kind,
+    ) -> None:
+        """Add the response to many phases of few changes at equidistant sample times."""
+        trains = []
+        for _, changes, lattice in records:
+            assert lattice.slots is not None
+            times = np.concatenate([phase.time + lattice.step * phase.blocks for phase in changes])
+            jumps = np.concatenate([phase.jumps for phase in changes])
+            origins = (lattice.times[0] - times[:, None] - delays) / lattice.step
+            trains.append(Train(origins, jumps, int(lattice.slots[-1]) + 1))
+        rows = len(response.coarse)
+        if element not in self.spectra or len(self.spectra[element]) < rows:
+            self.spectra[element] = plain_spectrum(response.coarse, self.circle)
+        read = partial(superposed, response, self.spectra[element][:rows], self.circle)
+        width = records[0][2].exposure / records[0][2].step
+        if width == 0.0:
+            found = read(trains, kind)
+        else:
+            before: Kind = "value" if kind == "slope" else "integral"
+            late, early = read(trains, before), read([train.earlier(width) for train in trains], before)
+            found = [(one - other) / width for one, other in zip(late, early, strict=True)]
+        for (target, _, lattice), readings in zip(records, found, strict=True):
+            target += readings[..., lattice.chosen]
 
     def _add_anywhere(
         self,
@@ -269,6 +319,19 @@ class Superposition:
                 if within.shape[1] == 1 and held <= _HELD:
                     response.readings[exact[k]] = read.padded
         return [self.kept[place] for place in places]
+
+
+def _places(records: Sequence[tuple[Sequence[Phase], Lattice]]) -> int:
+    """How many places in a block the equidistant samples of some records have after phases of few
+    changes [-]."""
+    lags = [
+        (lattice.times[0] - phase.time) / lattice.step
+        for changes, lattice in records
+        if lattice.slots is not None and lattice.times.size
+        for phase in changes
+        if phase.blocks.size <= _ADDED
+    ]
+    return len({round(float(lag % 1.0) / _SAME_PHASE) % _PLACES for lag in lags})
 
 
 def _read_anywhere(response: StepResponse, lattice: Lattice, onsets: Matrix, kind: Kind) -> Array:
