@@ -24,6 +24,7 @@ from lcopa_bayes.effectsearch.basemodel import Base, beside_effects, fitted_base
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.findings import Side, astray, findings_of, named_effects
+from lcopa_bayes.effectsearch.freedconstants import released
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.integerplants import integer_dynamics
 from lcopa_bayes.effectsearch.lags import (
@@ -43,7 +44,6 @@ from lcopa_bayes.effectsearch.openeffects import (
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
-from lcopa_bayes.effectsearch.refits import released
 from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
 from lcopa_bayes.effectsearch.scores import (
     State,

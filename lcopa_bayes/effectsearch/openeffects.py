@@ -21,7 +21,8 @@ from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.effectsearch.drawsabout import normal_draws
-from lcopa_bayes.effectsearch.refits import log_bayes_factor, loosened, places, without
+from lcopa_bayes.effectsearch.freedconstants import loosened
+from lcopa_bayes.effectsearch.refits import log_bayes_factor, places, without
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import State

@@ -11,8 +11,9 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.candidates import other_instance
+from lcopa_bayes.effectsearch.freedconstants import released
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.refits import SIGNIFICANT, refit, released
+from lcopa_bayes.effectsearch.refits import SIGNIFICANT, refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import _beside_others, search
 from lcopa_bayes.effectsearch.scores import State

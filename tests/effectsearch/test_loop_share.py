@@ -10,7 +10,7 @@ from test_loop_unseen import fitted
 from lcopa_bayes.bench.undeclared import LARGEST, campaign, drawn
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.refits import freed
+from lcopa_bayes.effectsearch.freedconstants import freed
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.model.effects.parallel import MissingCrossPath
 from lcopa_bayes.model.effects.response import Clipping
