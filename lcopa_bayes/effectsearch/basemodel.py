@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import Search, leading
+from lcopa_bayes.effectsearch.rounds import Look, Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -54,6 +54,8 @@ class Base(NamedTuple):
     """What was changed; empty when nothing was."""
     richer: tuple[Base, ...] = ()
     """Plants that contain it and were not chosen."""
+    look: Look | None = None
+    """What it leaves; None where nobody looked yet."""
 
 
 def structure_chosen(study: Study, *, as_stated: bool) -> bool:
@@ -114,9 +116,9 @@ def fitted_base(
             said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
-            named = _named(base, library, rng, draws, crew)
+            base, named = _named(base, library, rng, draws, crew, rival=gain)
             if named is not None and named.log_bayes_factor >= gain:
-                richer = _named(wider, library, rng, draws, crew)
+                wider, richer = _named(wider, library, rng, draws, crew)
                 if not _gain(base, wider, named, richer) > _GAIN:
                     base = _beside(base, wider)
                     break
@@ -270,12 +272,26 @@ def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | N
 
 
 def _named(
+    base: Base,
+    library: Sequence[type[Effect]],
+    rng: np.random.Generator,
+    draws: int,
+    crew: Crew,
+    rival: float = -np.inf,
+) -> tuple[Base, Refit | None]:
+    """A base fit that has been looked at, and the best named effect beside it, if that may reach a `rival`
+    [nat]."""
+    look = base.look or _look(base, library, rng, draws, crew)
+    if look.trace.alarmed:
+        look = look.refitted(base.start, crew, rival)
+    return base._replace(look=look), look.leading if look.trace.alarmed else None
+
+
+def _look(
     base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
-) -> Refit | None:
-    """The best named effect beside a base fit."""
+) -> Look:
     quiet = base.fit.noise_samples
-    seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
-    return leading(base.start, seen, crew) if seen.alarmed else None
+    return Look(trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew))
 
 
 def _explained(
@@ -283,7 +299,5 @@ def _explained(
 ) -> float:
     """Squared residual that the best named effect leaves of a base fit [response unit^2]; infinite without
     one that leaves noise."""
-    quiet = base.fit.noise_samples
-    seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
-    best = leading(base.start, seen, crew)
+    best = _look(base, library, rng, draws, crew).refitted(base.start, crew).leading
     return np.inf if best is None or too_smooth(best.optimum) else best.optimum.power

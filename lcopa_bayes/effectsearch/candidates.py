@@ -35,6 +35,9 @@ _INSTANCES = 16
 """Instances descended from, those of largest evidence [-]."""
 _FORCED = 3
 """The same beside a force that is already there, and of linear dynamics [-]."""
+_REACH = 0.5
+"""Share of the evidence of a rival below which a first descent is not followed further [-]: the rest of a
+refit does not double it."""
 _OTHER = 0.9
 """Cosine between signatures below which an instance of an effect is another [-]."""
 _STEPS = 12
@@ -52,11 +55,14 @@ def offered(study: Study) -> list[type[Effect]]:
     return [kind for kind in known if not kind.card.fields or "thermal" in kind.card.fields]
 
 
-def refitted(state: State, seen: Trace, crew: Crew = ALONE) -> tuple[list[Refit], list[str]]:
+def refitted(
+    state: State, seen: Trace, crew: Crew = ALONE, rival: float = -np.inf
+) -> tuple[list[Refit], list[str]]:
     """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
     Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
-    from the size of their prior. So are the classes of linear dynamics, which a name must beat.
+    from the size of their prior. So are the classes of linear dynamics, which a name must beat. What a first
+    descent leaves far below a `rival` [nat] is not refitted to the end.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
     worth = {one.name: one.signature for one in named if one.log_bayes_factor > 0}
@@ -77,7 +83,7 @@ def refitted(state: State, seen: Trace, crew: Crew = ALONE) -> tuple[list[Refit]
         if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
             worth[one.name] = one.signature
             sizes[one.name] = worth[one.name].amplitude(seen.residual, seen.scale)
-    known = crew.sharing((state, least if seen.alarmed else np.inf, far))
+    known = crew.sharing((state, least if seen.alarmed else np.inf, far, _REACH * rival))
     # of the trace a task needs one effect
     tasks = [(replace(seen, traced=(seen.of(name),)), amplitude) for name, amplitude in sizes.items()]
     ends = dict(zip(sizes, known.each(_refitted, tasks), strict=True))
@@ -86,9 +92,9 @@ def refitted(state: State, seen: Trace, crew: Crew = ALONE) -> tuple[list[Refit]
     return under_one_noise(done), failures
 
 
-def _refitted(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> Refit | str:
+def _refitted(known: tuple[State, float, bool, float], task: tuple[Trace, Vector]) -> Refit | str:
     """The refit of the only effect of a trace, or why there is none."""
-    (state, least, far), (seen, amplitude) = known, task
+    (state, least, far, reach), (seen, amplitude) = known, task
     (traced,) = seen.traced
     effect, reached_at = traced.signature.effect, None
     try:
@@ -101,7 +107,7 @@ def _refitted(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> R
         if other is not None:
             starts.append((other.effect, other.amplitude(seen.residual, seen.scale)))
         base = (state.model, state.optimum, state.whitening)
-        ends = [refit(*base, [start], seen.scale.quiet, near=reached_at) for start in starts]
+        ends = [refit(*base, [one], seen.scale.quiet, near=reached_at, least=reach) for one in starts]
     except ArithmeticError as error:
         return str(error)
     return min(ends, key=lambda end: end.optimum.cost)

@@ -1,4 +1,4 @@
-"""Internal constants of effects as parameters of a descent: a shutter time, a corner, the phase of a frame."""
+"""Internal constants of effects as parameters of a descent: a shutter time, a corner, a phase of frames."""
 
 from __future__ import annotations
 

@@ -323,7 +323,7 @@ def _searched(base: Base, rounds: Callable[..., Search]) -> Search:
     """Rounds under the noise that was measured; where too few samples at rest measured it and nothing stands
     out, again under noise known from the residual alone."""
     fit = base.fit
-    found = rounds(base.start, noise_samples=fit.noise_samples)
+    found = rounds(base.start, noise_samples=fit.noise_samples, first=base.look)
     if fit.noise_known and not found.rounds[-1].trace.alarmed:
         found = found.settled
         if not all(one.firm for one in fit.noise) and not found.state.model.effects:

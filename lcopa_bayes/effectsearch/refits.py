@@ -217,6 +217,7 @@ def refit(
     added: Sequence[tuple[Effect, Vector]],
     quiet: float,
     near: Vector | None = None,
+    least: float = -np.inf,
 ) -> Refit:
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
@@ -224,7 +225,8 @@ def refit(
     noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then frees the
     effects' internal constants too (`freed`), and ends with the tangents of the whole. The evidence pays
     for the choice among the instances that were tried. `near` are further coordinates to start from.
-    ArithmeticError when no start has a bounded response.
+    ArithmeticError when no start has a bounded response, or what the first descent takes off the residual is
+    worth less than `least` [nat].
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     size = sum(psi.size for _, psi in added)
@@ -236,7 +238,15 @@ def refit(
         starts += [model.delayed(starts[0], share) for share in _DELAYS]
     starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
-    quick, _ = Regression(replace(extended, exact=False), whitening).lowest(starts, gain=_NEAR)
+    first = Regression(replace(extended, exact=False), whitening)
+    quick, _ = first.lowest(starts, gain=_NEAR)
+    if np.isfinite(least):
+        scale = Scale(quiet, whitening.effective - quick.size, np.array([2 * before.cost]))
+        worth = float(scale.gain(np.array([before.cost - first.cost(quick)]))[0])
+        if worth < least:
+            raise ArithmeticError(
+                f"a first descent is worth {worth:.3g} nat, where {least:.3g} or more count"
+            )
     extended, start = freed(extended, quick, whitening, tuple(effect.name for effect, _ in added))
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)

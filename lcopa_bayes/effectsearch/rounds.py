@@ -48,6 +48,31 @@ _PAIRS = 2
 
 @final
 @dataclass(frozen=True, eq=False)
+class Look:
+    """What a state leaves, and its candidates once they are refitted."""
+
+    trace: Trace
+    refits: tuple[Refit, ...] | None = None
+    """By falling evidence; None before there are any."""
+    failures: tuple[str, ...] = ()
+    """Candidates that could not be refitted, and why."""
+
+    def refitted(self, state: State, crew: Crew, rival: float = -np.inf) -> Look:
+        """With the candidates of the state refitted, those far below a `rival` [nat] not to the end."""
+        if self.refits is not None:
+            return self
+        refits, failures = refitted(state, self.trace, crew, rival)
+        return Look(self.trace, tuple(refits), tuple(failures))
+
+    @property
+    def leading(self) -> Refit | None:
+        """The single named effect of most evidence that would be accepted; None without any."""
+        likely = accepted(self.refits or (), self.trace, self.trace.threshold)
+        return next((one for one in likely if not one.dynamics), None)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Round:
     """One look at a residual."""
 
@@ -120,28 +145,33 @@ def search(
     noise_samples: Sequence[int],
     draws: int,
     alone: bool = False,
+    first: Look | None = None,
     crew: Crew = ALONE,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that is `alone` only large ones; then try pairs where something remains, and
-    take back what is no longer significant."""
+    take back what is no longer significant. The `first` look may be known already."""
     state, rounds = start, []
     groups: dict[str, tuple[str, ...]] = {}
     for number in range(MOST + 1):
-        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
+        look = first if first is not None and not number else None
+        if look is None:
+            look = Look(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
+        seen = look.trace
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
         beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
         crew.stage(f"refitting with each effect that comes into question{beside}")
-        refits, failures = refitted(state, seen, crew)
+        look = look.refitted(state, crew)
+        refits = look.refits or ()
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
         likely = [one for one in accepted(refits, seen, bar) if not alone or _large(one)]
         chosen = _leader(_beside_dynamics(likely, [one for one in refits if one.dynamics]))
         if chosen is not None and chosen.dynamics and groups:
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
-        rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
+        rounds.append(Round(seen, refits, look.failures, chosen))
         if chosen is None:
             break
         if not chosen.dynamics:
@@ -187,12 +217,6 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
     gained = log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
     return gained, plain.cost - state.optimum.cost
-
-
-def leading(start: State, seen: Trace, crew: Crew = ALONE) -> Refit | None:
-    """The single named effect of most evidence that would be accepted; None without any."""
-    likely = accepted(refitted(start, seen, crew)[0], seen, seen.threshold)
-    return next((one for one in likely if not one.dynamics), None)
 
 
 def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
