@@ -44,6 +44,8 @@ rest."""
 _LONGER, _SPARE = 6.0, 1.1
 """How many times as many draws a good proposal that gave too few gives at most, and factor on the number that
 is estimated to be lacking [-]."""
+_PORTION = 250
+"""Draws between two looks at the clock, of responses with effects [-]."""
 _LIGHT, _HEAVY, _CLOSE = 0.4, 0.9, 0.3
 """Pareto k up to which a proposal gives more draws rather than being fitted further, if it is efficient, and
 from which a third attempt has little hope; effective draws per draw at which one is that need not be close
@@ -116,9 +118,10 @@ def importance(
     rough: Callable[[Matrix], Vector] | None = None,
 ) -> Importance | None:
     """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
-    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
-    optimum has a surrounding inside the prior. The proposal is fitted to a `rough` density of charted
-    coordinates, where there is a cheaper one; its draws are weighted by the posterior itself.
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made, and no further
+    draws of responses with effects are simulated, but for a few of the last proposal. None where no optimum
+    has a surrounding inside the prior. The proposal is fitted to a `rough` density of charted coordinates,
+    where there is a cheaper one; its draws are weighted by the posterior itself.
 
     FloatingPointError where the density is NaN.
     """
@@ -129,7 +132,10 @@ def importance(
         return None
     cores = [first, *(first.marginal(own) for own in groups if len(groups) > 1)]
     proposal: Proposal = first
-    rough = rough or partial(charted_density, posterior, chart, mapped=mapped)
+    exact = partial(charted_density, posterior, chart, mapped=mapped)
+    rough = rough or exact
+    dear = posterior.simulation is not None and posterior.surrogate is None
+    portion = _PORTION if dear else None
     rows = [posterior.table.rows[k] for k in posterior.sampled]
     orders = np.flatnonzero([row.kind == "order" for row in rows])
     seen = Seen()
@@ -138,8 +144,8 @@ def importance(
             cores = [split(core, rng) for core in cores]
         worth = np.inf
         for _ in range(effort.rounds):
-            y = proposal.draw(effort.learning, rng)
-            seen = seen.joined(proposal, len(y), y, rough(y))
+            y, density = _evaluated(proposal.draw(effort.learning, rng), rough, late, portion)
+            seen = seen.joined(proposal, len(y), y, density)
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
@@ -164,9 +170,8 @@ def importance(
         y, density = np.empty((0, posterior.dimension)), np.empty(0)
         count = effort.learning if last else effort.draws
         while count:
-            more = proposal.draw(count, rng)
-            y = np.concatenate([y, more])
-            density = np.append(density, charted_density(posterior, chart, more, mapped))
+            more, known = _evaluated(proposal.draw(count, rng), exact, late, portion)
+            y, density = np.concatenate([y, more]), np.append(density, known)
             weighted = _weighted(posterior, chart, y, density, density - proposal.log_density(y))
             count = 0 if last else _lacking(weighted, plan, _LONGER * effort.draws)
         spent = sum(map(len, seen.points)) + len(y)
@@ -176,6 +181,20 @@ def importance(
             break
         seen = seen.joined(proposal, len(y), y, density)
     return result
+
+
+def _evaluated(
+    y: Matrix, density: Callable[[Matrix], Vector], late: Callable[[], bool], portion: int | None
+) -> tuple[Matrix, Vector]:
+    """Draws and their densities, all at once or portion by portion, none further once it is late."""
+    size = portion or len(y)
+    known = [density(y[:size])]
+    for begin in range(size, len(y), size):
+        if late():
+            break
+        known.append(density(y[begin : begin + size]))
+    done = np.concatenate(known)
+    return y[: done.size], done
 
 
 def _lacking(weighted: Weighted, plan: ImportancePlan, most: float) -> int:

@@ -18,7 +18,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling import weightedrun
-from lcopa_bayes.sampling.importance import importance
+from lcopa_bayes.sampling.importance import _PORTION, Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import LARGEST_K, effective
 from lcopa_bayes.sampling.run import SamplePlan
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted, tail_smoothed
@@ -235,3 +235,19 @@ def test_a_budget_ends_importance_draws(stiff: tuple[Posterior, Optimum]):
     assert short[0].stopped_after is not None
     assert 2 * short[1].ess < whole[1].ess
     assert any("budget" in one.reason for one in short[1].limitations)
+
+
+def test_a_budget_ends_a_round_of_responses_with_effects(stiff: tuple[Posterior, Optimum]):
+    """A round of them may take minutes: it is late within the first, and the last proposal has a portion."""
+    posterior, optimum = stiff
+    plan = ImportancePlan((Effort(2_000, 1_000, 4),))
+    asked = []
+    short = importance(
+        posterior, [optimum], np.random.default_rng(3), plan, late=lambda: len(asked.append(0) or asked) > 1
+    )
+    assert short is not None
+    assert short.evaluations == 3 * _PORTION  # late after the second portion of the first round
+    near = replace(posterior, surrogate=Surrogate.of(posterior, optimum, np.random.default_rng(2)))
+    cheap = importance(near, [optimum], np.random.default_rng(3), plan, late=lambda: True)
+    assert cheap is not None
+    assert cheap.evaluations == 2_000  # rounds of a surrogate take no time
