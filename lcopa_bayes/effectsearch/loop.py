@@ -114,13 +114,16 @@ class Loop:
 
     @property
     def grade(self) -> Grade:
-        """How far the numbers can be trusted: as far as the verdict, and without draws no further than a
-        Laplace approximation."""
+        """How far the numbers can be trusted: as far as verdict and model, and without draws no further
+        than a Laplace approximation."""
         if self.draws is not None:
-            if self.draws.grade.level == "reliable" and self.verdict.confidence == "tentative":
-                return Grade(
-                    "tentative", "the draws are reliable, but the verdict that they rest on is tentative"
-                )
+            limit = ""
+            if self.verdict.confidence == "tentative":
+                limit = "the verdict that they rest on is tentative"
+            elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
+                limit = "the records hold something that the model they are of does not explain"
+            if limit and self.draws.grade.level == "reliable":
+                return Grade("tentative", f"the draws are reliable, but {limit}")
             return self.draws.grade
         return Grade(
             "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
@@ -284,7 +287,7 @@ def _looped(
         factors = state.model.wider
         wide = {name: factors[name] for name in named_effects(state) if name in factors}
         verdict = widened(verdict, wide)
-    if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].alarmed:
+    if verdict.leaves or searched.rounds[-1].alarmed:
         white = state.whitening  # something significant remains, which bands have to hold
         state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
     drawn, sampled = None, None

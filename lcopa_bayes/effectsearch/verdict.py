@@ -46,6 +46,11 @@ class Verdict:
     confidence: Confidence
     sentence: str
 
+    @property
+    def leaves(self) -> bool:
+        """Whether something remains that nothing explains."""
+        return self.kind in ("unexplained", "partly explained")
+
 
 @final
 @dataclass(frozen=True)

@@ -162,6 +162,24 @@ def test_a_loop_is_no_more_reliable_than_its_verdict(bent, confidence, level):
     assert one.grade.level == level
 
 
+@pytest.mark.parametrize(
+    ("kind", "support", "level"),
+    [
+        ("explained", "plant", "reliable"),
+        ("clean", "plant", "reliable"),
+        ("partly explained", "plant", "tentative"),
+        ("unexplained", "plant", "tentative"),
+        ("unexplained", "lags", "reliable"),
+    ],
+)
+def test_numbers_of_a_model_that_leaves_something_are_tentative(bent, kind, support, level):
+    """Unless sums of lags, which the numbers are over too, follow what it leaves."""
+    draws = SimpleNamespace(grade=Grade("reliable", "draws agree"))
+    verdict = replace(bent.verdict, kind=kind, confidence="firm")
+    one = replace(bent, verdict=verdict, draws=draws, lags=(SimpleNamespace(support=support),))
+    assert one.grade.level == level
+
+
 def test_parameters_without_draws_are_values_and_not_coordinates(clean):
     """A time was printed as its logarithm, 1.2 ms where the viscosity of 3 makes it 3.39 ms."""
     printed = {row["name"]: row for row in results(clean)["parameters"]}
