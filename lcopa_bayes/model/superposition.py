@@ -187,7 +187,7 @@ class Superposition:
         """
         shape = response.coarse.shape[:2]
         out = [np.zeros((*shape, lattice.times.size)) for _, lattice in records]
-        scattered: list[tuple[Array, Sequence[Phase], Lattice]] = []
+        scattered: dict[float, list[tuple[Array, Sequence[Phase], Lattice]]] = {}
         apart = _places(records) > _APART
         for target, (changes, lattice) in zip(out, records, strict=True):
             if not lattice.times.size:
@@ -197,7 +197,7 @@ class Superposition:
                 continue
             few = [phase for phase in changes if apart and phase.blocks.size <= _ADDED]
             if few:
-                scattered.append((target, few, lattice))
+                scattered.setdefault(lattice.exposure, []).append((target, few, lattice))
                 changes = [phase for phase in changes if phase.blocks.size > _ADDED]
             begins = np.array([phase.time for phase in changes])
             origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
@@ -206,8 +206,9 @@ class Superposition:
             ):
                 self._add_on_lattice(target, phase, origin, read, lattice)
         together = max(1, _TOGETHER // (self.circle.n * shape[0] * shape[1]))
-        for begin in range(0, len(scattered), together):
-            self._add_scattered(scattered[begin : begin + together], response, delays, key[0], kind)
+        for alike in scattered.values():
+            for begin in range(0, len(alike), together):
+                self._add_scattered(alike[begin : begin + together], response, delays, key[0], kind)
         return out
 
     def _add_scattered(
@@ -218,7 +219,7 @@ class Superposition:
         element: int,
         kind: Kind,
     ) -> None:
-        """Add the response to many phases of few changes at equidistant sample times."""
+        """Add the response to many phases of few changes at equidistant sample times of one exposure."""
         trains = []
         for _, changes, lattice in records:
             assert lattice.slots is not None

@@ -27,8 +27,9 @@ def plant(drives: list[tuple[np.ndarray, np.ndarray]], times: list[np.ndarray], 
     """A plant of one path with two terms on records of some changes and sample times."""
     layout = Layout.of((AXIS,), (AXIS,), ModelSettings(terms=2))
     experiments = []
-    for (at, jumps), when in zip(drives, times, strict=True):
-        mesh = Mesh.of_samples(when, float(at.min()), **options)
+    exposures = np.broadcast_to(options.pop("exposure", 0.0), len(times))
+    for (at, jumps), when, exposure in zip(drives, times, exposures, strict=True):
+        mesh = Mesh.of_samples(when, float(at.min()), exposure=float(exposure), **options)
         experiments.append(Experiment("one", mesh, (AxisDrive.of_jumps(at, jumps),), np.zeros(1)))
     return ForwardModel(layout, tuple(experiments))
 
@@ -52,10 +53,11 @@ def records(rng) -> tuple[list[tuple[np.ndarray, np.ndarray]], list[np.ndarray]]
     return drives, even
 
 
-@pytest.mark.parametrize("exposure", [0.0, 0.13, 0.9])
+@pytest.mark.parametrize("exposure", [0.0, 0.13, 0.9, (0.0, 0.2, 0.0, 0.7)])
 def test_many_phases_are_those_read_one_by_one(exposure, rng, monkeypatch):
     drives, times = records(rng)
-    model = plant(drives, times, exposure=exposure)
+    model = plant(drives, times, exposure=exposure, blocks=1)
+    assert len(model.circles) == 1  # blocks of one width, so that the records are read together
     together = numbers(model)
     monkeypatch.setattr(superposition, "_APART", 10**6)
     for found, wanted in zip(together, numbers(model), strict=True):
