@@ -20,7 +20,7 @@ from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.effects import Effected, effected
-from lcopa_bayes.model.effects import balance, sensor
+from lcopa_bayes.model.effects import balance, sensor, simulator
 from lcopa_bayes.model.effects.catalogue import bundled, catalogue
 from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold, SampledDrive
 from lcopa_bayes.model.effects.dynamics import (
@@ -525,6 +525,40 @@ def test_stiff_plants_together_are_each_by_itself():
         ):
             alone = made.simulator.moved(plant, psi)[0].deflection
             assert_allclose(moved[0].deflection, alone, atol=1e-9 * np.abs(alone).max())
+
+
+@pytest.mark.parametrize("blocks", [1, 1 << 18])
+@pytest.mark.parametrize(
+    ("names", "psis"),
+    [
+        (["sensor_lag"], [[0.3], [0.3], [0.5], [0.0]]),
+        (["exposure"], [[0.2], [0.2], [0.4], [0.2]]),
+        (["viscosity_drift"], [[0.3], [-0.2], [0.3], [0.0]]),
+        (["viscosity_drift", "sensor_lag"], [[0.3, 0.2], [-0.2, 0.4], [0.0, 0.2], [0.3, 0.0]]),
+        (["sensor_lag", "odd_curvature"], [[0.3, 0.1], [0.3, 0.1], [0.0, 0.1], [0.3, 0.0]]),
+    ],
+)
+def test_plants_together_are_each_by_itself(names, psis, blocks, monkeypatch):
+    """Before the sensor and on elements; plants differ in a time, a delay and gains, the scenes in these."""
+    monkeypatch.setattr(simulator, "_TOGETHER", blocks)
+    made = BASE.with_effects([ALL[name].grid(BASE.ranges)[0] for name in names])
+    table = np.array(BASE.table.names)
+    factors = [
+        np.where(np.char.startswith(table, kind), 1.2, 1.0) for kind in ("none", "time", "delay", "gain")
+    ]
+    cases = [(made.plant(VALUES * factor), np.array(psi)) for factor, psi in zip(factors, psis, strict=True)]
+    for case, moved in zip(cases, made.simulator.moved_together(cases), strict=True):
+        for one, other in zip(moved, made.simulator.moved(*case), strict=True):
+            assert_allclose(one.deflection, other.deflection, rtol=0, atol=1e-9)
+            assert_allclose(one.scene.gains, case[0].gains)
+            assert_allclose(one.scene.delays, other.scene.delays)
+
+
+def test_a_plant_that_runs_backwards_among_others_is_reported():
+    made = BASE.with_effects([ALL["viscosity_drift"].grid(BASE.ranges)[0]])
+    plant = made.plant(VALUES)
+    with pytest.raises(UnstableError, match="time constants would be multiplied by -"):
+        made.simulator.moved_together([(plant, np.array([psi])) for psi in (0.1, 40.0, -40.0)])
 
 
 def test_a_sampled_drive_is_a_delay_that_coefficients_move():

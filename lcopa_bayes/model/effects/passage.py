@@ -22,18 +22,23 @@ from lcopa_bayes.model.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
+from lcopa_bayes.model.effects.forcedrows import ForcedRows, Forces
+from lcopa_bayes.model.forward import (
+    Dynamics,
+    Experiment,
+    ForwardModel,
+    StepResponses,
+    deflections,
+    joined,
+)
 from lcopa_bayes.model.grid import CUBIC
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Integrals, transfer
 
 Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
-Forces: TypeAlias = Sequence[tuple[ForceEffect, Array]]
-"""Forces with their coefficients: (coefficients,) of one plant, or (coefficients, plants times axes, 1), the
-constants that differ likewise."""
-Kernels: TypeAlias = dict[tuple[int, float, float], Matrix]
-"""Responses to an impulse by element, width of the blocks, and the factor on time constants."""
+Kernels: TypeAlias = dict[tuple[int, float, bytes], Matrix]
+"""Responses to an impulse by element, width of the blocks, and the factors on time constants."""
 _SWEEPS, _FEWER = 50, 18
 """Most sweeps of the iteration, and where responses need not be so accurate [-]: what they do not bring to
 rest is solved block by block."""
@@ -127,33 +132,50 @@ def _earlier(model: ForwardModel, by: float) -> ForwardModel:
 
 
 def passed(
-    model: ForwardModel, scenes: Sequence[Scene], plant: Plant, acting: Sequence[Acting]
-) -> list[Moved]:
-    """Every record with effects on elements, forces and sensors; raises UnstableError."""
+    model: ForwardModel,
+    plants: Sequence[Plant],
+    scenes: Sequence[Sequence[Scene]],
+    acting: Sequence[Sequence[Acting]],
+) -> list[list[Moved]]:
+    """Every record of some plants with effects on elements, forces and sensors; raises UnstableError.
+
+    Scenes and what is acting are those of every plant on every record: the same commands and effects, of
+    several plants no forces, with coefficients of their own.
+    """
     kernels: Kernels = {}
-    out = []
-    for experiment, scene, own, without in zip(
-        model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
+    out: list[list[Moved]] = [[] for _ in plants]
+    gains, dynamics = np.array([plant.gains for plant in plants]), joined([one.dynamics for one in plants])
+    for r, (experiment, units) in enumerate(
+        zip(model.experiments, model.unit_responses(dynamics), strict=True)
     ):
-        stretch = float(np.prod([e.stretch(scene, psi) for e, psi in own if isinstance(e, ElementEffect)]))
-        failures = {0: f"its time constants would be multiplied by {stretch:.3g}"}
-        if 0 < stretch < np.inf:
+        here, own = [each[r] for each in scenes], [each[r] for each in acting]
+        stretch = np.array([_stretch(scene, effects) for scene, effects in zip(here, own, strict=True)])
+        failures = dict[int, str]()
+        for b in np.flatnonzero(~((stretch > 0) & (stretch < np.inf))).tolist():
+            failures[b] = f"its time constants would be multiplied by {stretch[b]:.3g}"
+        if not failures:
+            filters = [
+                (e, [(scene, one[k][1]) for scene, one in zip(here, own, strict=True)])
+                for k, (e, _) in enumerate(own[0])
+                if isinstance(e, SensorEffect)
+            ]
+            forces = [(e, psi) for e, psi in own[0] if isinstance(e, ForceEffect)]
             passage = Passage(
-                model.layout,
-                experiment,
-                scene,
-                plant.gains[None],
-                plant.dynamics,
-                [(e, psi) for e, psi in own if isinstance(e, ForceEffect)],
-                kernels,
-                stretch,
-                [(e, psi) for e, psi in own if isinstance(e, SensorEffect)],
+                model.layout, experiment, here[0], gains, dynamics, forces, kernels, stretch, filters
             )
             change, failures = passage.change()
         if failures:
-            raise UnstableError(tuple(effect.name for effect, _ in own), experiment.name, failures[0])
-        out.append(Moved(scene, without.deflection + change[:, 0].T))
+            names = tuple(effect.name for effect, _ in own[0])
+            raise UnstableError(names, experiment.name, next(iter(failures.values())))
+        deflection = deflections(model.layout, here[0].rest, gains, units) + change
+        for b, (each, scene) in enumerate(zip(out, here, strict=True)):
+            each.append(Moved(scene, deflection[:, b].T))
     return out
+
+
+def _stretch(scene: Scene, acting: Acting) -> float:
+    """Factor on all time constants of a plant [-]."""
+    return float(np.prod([e.stretch(scene, psi) for e, psi in acting if isinstance(e, ElementEffect)]))
 
 
 @final
@@ -175,10 +197,10 @@ class Passage:
     forces: Forces
     kernels: Kernels
     """Of elements, (batch, blocks), shared by the records of these plants."""
-    stretch: float = 1.0
-    """Factor on all time constants [-]."""
-    filters: Sequence[tuple[SensorEffect, Vector]] = ()
-    """Of the sensor, with their coefficients."""
+    stretch: Vector | None = None
+    """Factor on all time constants of each plant, (batch,) [-]; None where it is 1."""
+    filters: Sequence[tuple[SensorEffect, Sequence[tuple[Scene, Vector]]]] = ()
+    """Of the sensor, with scene and coefficients of each plant."""
     tolerance: float = TOLERANCE
     """Accuracy of the balance of forces over the scale of the response [-]."""
 
@@ -189,12 +211,12 @@ class Passage:
         added, at_rest, failures = np.zeros((axes, batch, n)), np.zeros((axes, batch)), dict[int, str]()
         if self.forces:
             at_rest, added, failures = self._balanced()
-        if self.filters or self.stretch != 1.0:
-            linear, moved = self._linear(1.0), self._linear(self.stretch) + added
-            for effect, psi in self.filters:
-                moved = np.stack(
-                    [effect.filtered(moved[:, b], self.scene, psi) for b in range(batch)], axis=1
-                )
+        stretched = self.stretch is not None and (self.stretch != 1.0).any()
+        if self.filters or stretched:
+            linear = self._linear(np.ones(batch))
+            moved = added + (self._linear(self._factors) if stretched else linear)
+            for effect, own in self.filters:
+                moved = np.stack([effect.filtered(moved[:, b], *each) for b, each in enumerate(own)], axis=1)
             added = moved - linear
         read = self.experiment.mesh.reading(added.reshape(-1, n))
         out = read.reshape(axes, batch, -1) + at_rest[..., None]
@@ -202,20 +224,25 @@ class Passage:
             failures.setdefault(b, "the response is not finite")
         return out, failures
 
+    @property
+    def _factors(self) -> Vector:
+        return np.ones(len(self.gains)) if self.stretch is None else self.stretch
+
     def _kernel(self, element: int, n: int) -> Matrix:
         """The first n block means of an element's response to an impulse, (batch, n)."""
         step = self.experiment.mesh.grid.step
-        key = (element, step, self.stretch)
+        key = (element, step, self._factors.tobytes())
         if key not in self.kernels or self.kernels[key].shape[1] < n:
             times, orders = self.dynamics.times[element], self.dynamics.orders[element]
             circle = Circle(n)
-            spectrum = transfer(self.stretch * times / step, Integrals(orders, n), circle)
+            spectrum = transfer(self._factors[:, None] * times / step, Integrals(orders, n), circle)
             self.kernels[key] = circle.coefficients(spectrum)
         return self.kernels[key][:, :n]
 
-    def _linear(self, stretch: float) -> Array:
+    def _linear(self, stretch: Vector) -> Array:
         """Block means of the deflections of the plants alone from rest, with all time constants times
-        `stretch`, (axes, batch, blocks)."""
+        `stretch`, (batch,), (axes, batch, blocks). Most plants of a batch differ in a single number: what
+        several have in common is evaluated once."""
         out = np.zeros((self.scene.ranges.axes, len(self.gains), self.experiment.mesh.grid.n))
         circle, step = self.experiment.circle, self.experiment.mesh.grid.step
         for i, row in enumerate(self.layout.unit_of):
@@ -223,11 +250,14 @@ class Passage:
                 element, delay, axis = self.layout.units[unit]
                 if not self.scene.drives[axis].moves:
                     continue
-                late = self.dynamics.delays[:, delay]
+                late, whose = np.unique(self.dynamics.delays[:, delay], return_inverse=True)
                 means = self.scene.drives[axis].block_means(self.experiment.edges, late)[0]
                 times, orders = self.dynamics.times[element], self.dynamics.orders[element]
-                spectrum = transfer(stretch * times / step, Integrals(orders, circle.n), circle)
-                spectrum *= circle.spectrum(means)
+                shapes = np.concatenate([stretch[:, None] * times / step, orders], axis=1)
+                shapes, which = np.unique(shapes, axis=0, return_inverse=True)
+                times, orders = np.split(shapes, 2, axis=1)
+                spectrum = transfer(times, Integrals(orders, circle.n), circle)[which]
+                spectrum *= circle.spectrum(means)[whose]
                 out[i] += self.gains[:, i, j, None] * circle.coefficients(spectrum)
         return out
 
@@ -262,7 +292,7 @@ class Passage:
         )
         kernel = np.stack([self._kernel(self.layout.element_of[i][j], n) for i, j in direct], axis=1)
         f0, f = rest.reshape(-1, 1), gains[..., None] * means
-        problem = _Forced(
+        problem = ForcedRows(
             self.forces,
             replace(self.scene, ranges=replace(ranges, response=np.tile(ranges.response, batch))),
             f0 + f.reshape(len(f0), -1),
@@ -330,47 +360,3 @@ def _shifted(means: Matrix, place: Vector, n: int) -> Matrix:
     taken = np.take_along_axis(np.pad(means, ((0, 0), (1, 0))), at, axis=1)
     weights = np.vander(place - first + 1.0, 4, increasing=True) @ CUBIC
     return np.asarray(sum(weights[:, k, None] * taken[:, k : k + n] for k in range(4)))
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Forced:
-    """Forces on the direct paths of plants, a row for every axis of every plant."""
-
-    forces: Forces
-    scene: Scene
-    """Its scales have a value per row."""
-    f: Matrix
-    """Gain times delayed drive, (rows, blocks) [response unit]."""
-    step: float
-    """Width of a block [time unit]."""
-
-    def acting(self, rows: Index, f: Matrix, motion: Motion) -> Matrix:
-        """The force that acts on some of the rows."""
-        ranges = self.scene.ranges
-        own = replace(self.scene, ranges=replace(ranges, response=ranges.response[rows]))
-        for effect, psi in self.forces:
-            one, mine = (effect, psi) if psi.ndim == 1 else (_of_rows(effect, rows), psi[:, rows])
-            f = one.force(f, motion, own, mine)
-        return f
-
-    def deviation(
-        self, level: Matrix, rows: Index, blocks: slice | Index, y: Matrix, one: Matrix, two: Matrix
-    ) -> Matrix:
-        """That force less the level (rows, 1), from y less the level and its values one and two blocks
-        before."""
-        last, before = y - one, one - two
-        bend = (last - before) / self.step**2
-        rate = last / self.step + 0.5 * self.step * bend
-        motion = Motion(level[rows] + y, rate, bend)
-        # whole rows would be copied for a few of their blocks
-        f = self.f[rows, blocks] if isinstance(blocks, slice) else self.f[rows[:, None], blocks]
-        return self.acting(rows, f, motion) - level[rows]
-
-
-def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:
-    """The effect with those constants that differ from row to row taken of some rows."""
-    constants = {
-        name: value[rows] for name, value in effect.constants.items() if isinstance(value, np.ndarray)
-    }
-    return replace(effect, **constants) if constants else effect

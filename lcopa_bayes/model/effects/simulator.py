@@ -28,6 +28,8 @@ from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
+_TOGETHER = 1 << 18
+"""Plants times blocks that are simulated at once [-]."""
 
 _Value = TypeVar("_Value")
 
@@ -137,12 +139,13 @@ class Simulator:
         scenes = self.scenes(plant, psi)
         model = self.driven(scenes)
         if any(acting):
-            return passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
+            own = [self._acting(acting, psi, r) for r in range(len(scenes))]
+            return passed(model, [plant], [scenes], [own])[0]
         return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
 
     def moved_together(self, cases: Sequence[tuple[Plant, Vector]]) -> list[list[Moved]]:
         """`moved` of many plants and coefficients: at once where all that acts before the reading are forces
-        that take many.
+        that take many, or no forces and nothing on the commands.
 
         Raises UnstableError.
         """
@@ -159,7 +162,7 @@ class Simulator:
         ]
         lags = [(one, own) for one, own in acting if isinstance(one, DriveEffect) and one.lags]
         if not forces or len(forces) + len(lags) < len(acting):
-            return [self.moved(plant, psi) for plant, psi in cases]
+            return self._passed_together(cases)
         plants, records = [plant for plant, _ in cases], range(len(self.model.experiments))
         gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
         for effect, own in lags:
@@ -174,6 +177,38 @@ class Simulator:
             for b, each in enumerate(out):
                 each.append(Moved(scenes[b][r], deflection[:, b].T))
         return out
+
+    def _passed_together(self, cases: Sequence[tuple[Plant, Vector]]) -> list[list[Moved]]:
+        """`moved` of many plants and coefficients, at once of those under which the same effects act, all of
+        them on elements or before the sensor."""
+        alike: dict[tuple[bool, ...], list[int]] = {}
+        for k, (_, psi) in enumerate(cases):
+            alike.setdefault(tuple(self._upstream(psi)), []).append(k)
+        out: dict[int, list[Moved]] = {}
+        longest = max(experiment.mesh.grid.n for experiment in self.model.experiments)
+        size = max(1, _TOGETHER // longest)
+        for acts, every in alike.items():
+            kinds = [effect for effect, does in zip(self.effects, acts, strict=True) if does]
+            if not kinds or any(isinstance(effect, (DriveEffect, ForceEffect)) for effect in kinds):
+                out |= {k: self.moved(*cases[k]) for k in every}
+                continue
+            for begin in range(0, len(every), size):
+                some = every[begin : begin + size]
+                scenes = [self.scenes(*cases[k]) for k in some]
+                own = [
+                    [self._acting(acts, cases[k][1], r) for r in range(len(self.model.experiments))]
+                    for k in some
+                ]
+                found = passed(self.model, [cases[k][0] for k in some], scenes, own)
+                out |= dict(zip(some, found, strict=True))
+        return [out[k] for k in range(len(cases))]
+
+    def _upstream(self, psi: Vector) -> list[bool]:
+        """Of each effect, whether it acts before the reading."""
+        return [
+            isinstance(effect, UPSTREAM) and bool(psi[part].any())
+            for effect, part in zip(self.effects, self._slices, strict=True)
+        ]
 
     def _bending(self, psi: Vector) -> list[bool]:
         """Of each effect, whether it acts between commands and reading."""
