@@ -22,6 +22,8 @@ from lcopa_bayes.model.forward import forward_model
 ALL = bundled()
 LAYOUTS = [(1, 1), (1, 2), (2, 1), (3, 2)]
 """Drives and responses."""
+SHORT = [(1, 1), (3, 2)]
+"""Of them those of the short form: what applies to any of them applies to the last."""
 TIMES = 0.2 * np.arange(48)
 DARK, ONE_SAMPLE = ("dark", "resting"), ("one dark", "one resting", "one moving", "one of many")
 
@@ -70,7 +72,12 @@ def plants(drives: int, responses: int) -> tuple[Effected, Effected, np.ndarray]
 
 
 CASES = [
-    pytest.param(*layout, name, id=f"{layout[0]}x{layout[1]}-{name}")
+    pytest.param(
+        *layout,
+        name,
+        id=f"{layout[0]}x{layout[1]}-{name}",
+        marks=[pytest.mark.slow] * (layout not in SHORT),
+    )
     for layout in LAYOUTS
     for name in ALL
     if ALL[name].applies(plants(*layout)[0].table.layout)
