@@ -48,6 +48,9 @@ def folder(fitted, tmp_path_factory):
 
 
 @pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize(
+    "fitted", ["white", pytest.param("student", marks=pytest.mark.slow)], indirect=True, scope="module"
+)
 def test_a_page_drawn_while_the_rest_is_written_is_that_of_the_folder(fitted, tmp_path, jobs):
     fitted.save(tmp_path, jobs=jobs, page=True)
     page = tmp_path / "report.html"
