@@ -197,7 +197,7 @@ def test_terms_that_cannot_be_exchanged_stay_in_order(priors):
     posterior = made(SHORT, terms=2, priors=priors)
     least, rng = LeastSquares(posterior), np.random.default_rng(0)
     ends = []
-    for start in posterior.table.draw(15, rng):
+    for start in posterior.table.draw(8, rng):
         start = start.copy()
         start[posterior.table.of_kind("sigma")] = 0.05
         ends.append(least.solve(start)[0])

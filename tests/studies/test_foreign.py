@@ -47,7 +47,7 @@ def transfer(kind: str, element: foreign.Element) -> object:
 def test_a_step_response_is_that_of_its_transfer_function(kind: str, lag: float) -> None:
     element = foreign.PLANTS[kind](TIME, np.random.default_rng(3))
     of = transfer(kind, element)
-    time = np.array([0.02, 0.3, 1.0, 4.0, 15.0])
+    time = np.array([0.02, 1.0, 15.0])
     exact = [float(mp.invertlaplace(lambda s: of(s) / (s * (1 + lag * s)), t, method="dehoog")) for t in time]
     seen = element.lagging(lag) if lag else element
     np.testing.assert_allclose(seen.rises(time), exact, rtol=1e-6, atol=3e-8)
