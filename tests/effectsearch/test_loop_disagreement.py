@@ -23,7 +23,8 @@ def of_two_axes(seed: int, to: tuple[float, float]) -> Record:
     return record(seed, device=TWO, command=command, name=f"r{seed}", camera=0.4)
 
 
-ON, HALF = record(1, name="on"), record(2, name="half", command=step(0.5, at=0.35))
+ON = record(1, name="on", camera=0.4)
+HALF = record(2, name="half", command=step(0.5, at=0.35), camera=0.4)
 LATE = record(3, command=step(1.0, at=5.0), duration=20.0, name="early")
 FIRST, SECOND, THIRD = (
     of_two_axes(seed, to) for seed, to in enumerate(((1.0, 0.6), (-0.5, 1.0), (1.0, 0.2)))

@@ -86,7 +86,13 @@ def test_paths_that_share_no_delay_are_recognised() -> None:
     )
     campaign = study(
         *(
-            record(k, device=apart, command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.0)), name=f"r{k}")
+            record(
+                k,
+                device=apart,
+                command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.0)),
+                name=f"r{k}",
+                camera=0.4,
+            )
             for k, to in ((1, (1.0, 0.0)), (2, (0.0, 1.0)))
         ),
         terms="auto",
@@ -94,7 +100,13 @@ def test_paths_that_share_no_delay_are_recognised() -> None:
     assert settled(campaign).model.delay == "path"
     alike = study(
         *(
-            record(k, device=TWO, command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.2)), name=f"r{k}")
+            record(
+                k,
+                device=TWO,
+                command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.2)),
+                name=f"r{k}",
+                camera=0.4,
+            )
             for k, to in ((1, (1.0, 0.2)), (2, (0.0, 1.0)))
         ),
         terms="auto",
