@@ -123,7 +123,7 @@ def test_what_is_derived_from_too_few_draws_is_graded_no_better(hasty):
 def test_a_budget_of_time_ends_sampling_and_says_what_more_would_give(tmp_path, monkeypatch):
     """Time is up after the fewest rounds there may be; resumed without a budget, all draws are the same."""
     settings = {"ensembles": 2, "walkers": 12, "steps": 80, "thin": 1, "target_ess": 5000, "seconds": 1e3}
-    task = study(record(camera=0.6), sampler=settings)
+    task = study(record(camera=0.6), sampler=settings, priors={"delay": 0.73, "order_1": 0.8})
     clock = iter([0.0, 1.0])  # begun, and tempering begins
     monkeypatch.setattr(sampler, "monotonic", lambda: next(clock, 2e3))
     short = fit(task, folder=tmp_path)
