@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
-LONG = ("identifiability-audit", "model-comparison", "next-experiment")
+LONG = ("identifiability-audit", "model-comparison", "next-experiment", "posterior-report")
 """Those that the short form leaves out."""
 
 

@@ -50,7 +50,7 @@ def distance(p, q):
 
 
 @pytest.mark.parametrize("seen", [0.0, 1.0, 4.0])
-@pytest.mark.parametrize("noise_sd", [0.5, 1.0])
+@pytest.mark.parametrize("noise_sd", [pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_a_scaled_gaussian_is_known_exactly(seen, noise_sd):
     kinds = ("prior", "likelihood")
     values, errors, off = ({kind: [] for kind in kinds} for _ in range(3))
