@@ -152,6 +152,7 @@ def test_a_lost_worker_is_said_in_words(tmp_path):
     assert "Inspect" not in row["reason"]
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_table(fleet, devices, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
