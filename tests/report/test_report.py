@@ -343,7 +343,8 @@ def test_second_rendering_gives_the_same_bytes(folder, html, tmp_path):
     assert all(re.fullmatch(r"[\w-]+\.svg", name) for name in names)
 
 
-@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_a_page_drawn_in_halves_is_the_same(folder, html, jobs):
     assert write_fit_page(folder, None, jobs=jobs).read_text(encoding="utf-8") == html
 
