@@ -29,7 +29,7 @@ LAG = TransferPath.of_times(1.0, 0.4, (2.0,), (1.0,))
 def fitted(path: TransferPath, terms: int) -> Fit:
     records = tuple(record(f"run{k}", (path,), 5 + k) for k in range(2))
     model = ModelSettings(terms=terms, share="none", delay="path")
-    return fit(Study("orders", None, "s", 3, records, (), model, sampler=QUICK))
+    return fit(Study("orders", None, "s", 3, records, (), model, noise={"kind": "white"}, sampler=QUICK))
 
 
 def parts(of: Fit) -> tuple[Alternatives, IntegerFit]:
