@@ -82,8 +82,8 @@ def test_clean_campaigns_are_missed_as_seldom_as_stated(kind, most):
 
 @pytest.mark.parametrize("kind", ["white", "coloured", "heavy"])
 def test_few_clean_campaigns_are_missed(kind):
-    beyond = np.count_nonzero(p_values(kind, range(12)) < CHANCE)
-    assert binom.sf(beyond - 1, 12, CHANCE) > 0.01
+    beyond = np.count_nonzero(p_values(kind, range(8)) < CHANCE)
+    assert binom.sf(beyond - 1, 8, CHANCE) > 0.01
 
 
 @pytest.mark.parametrize(("kind", "factor"), [("white", 1.25), ("coloured", 3.0), ("heavy", 1.5)])
