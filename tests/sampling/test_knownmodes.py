@@ -48,13 +48,15 @@ def test_a_needle_is_met_only_when_it_is_known():
 
 
 @pytest.mark.parametrize(
-    "share", [*(pytest.param(share, marks=pytest.mark.slow) for share in (0.5, 0.05)), 1e-6]
+    ("share", "seeds"),
+    [*(pytest.param(share, 4, marks=pytest.mark.slow) for share in (0.5, 0.05)), (1e-6, 2)],
 )
-def test_known_modes_keep_their_share_of_the_posterior(share):
+def test_known_modes_keep_their_share_of_the_posterior(share, seeds):
     """The posterior is invariant: starts on a mode do not make it larger than it is."""
-    found = np.array([share_of_the_needle(two_modes(share), STARTS, seed) for seed in range(4)])
-    error = found.std(ddof=1) / 2 + 0.15 * share + 1e-4
+    found = np.array([share_of_the_needle(two_modes(share), STARTS, seed) for seed in range(seeds)])
+    error = found.std(ddof=1) / np.sqrt(seeds) + 0.15 * share + 1e-4
     assert abs(found.mean() - share) < 4 * error
+    assert share > 0.01 or found.max() < 0.01  # two that differ would leave any mean within their error
 
 
 def test_starts_outside_the_prior_are_left_out_and_refused_when_there_are_no_others():
