@@ -50,12 +50,12 @@ def measured(seed: int, **options: object) -> Record:
 
 @pytest.mark.parametrize(("noise", "correlation"), [("white", 0.0), ("white+ar1", 0.0), ("student", 0.0)])
 def test_a_model_that_explains_its_record_is_rarely_limited(noise, correlation):
-    """At most one in a hundred is promised; of 30 three are four errors above."""
+    """At most one in a hundred is promised; of 15 three are four errors above."""
     alarms = 0
-    for seed in range(30):
+    for seed in range(15):
         made = problem(measured(seed, correlation=correlation), noise=noise)
         alarms += bool(found(made, about(made)))
-    assert alarms <= 30 * 0.02 + 4 * np.sqrt(30 * 0.02)
+    assert alarms <= 15 * 0.02 + 4 * np.sqrt(15 * 0.02)
 
 
 def test_correlated_noise_under_a_model_of_it_is_not_limited():
