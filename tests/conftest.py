@@ -14,3 +14,10 @@ def pytest_configure() -> None:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20260710)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Empty figures, for what a page says in words."""
+    empty = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"></svg>'
+    monkeypatch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: empty)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import redirect_stdout
+from io import StringIO
 from math import pi, sqrt
 from pathlib import Path
 
@@ -53,10 +55,17 @@ def study(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def optics(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("optics")
-    assert main(["optics", "--out", str(folder), "--quiet"]) == 0
-    return folder
+def told(tmp_path_factory) -> tuple[Path, str]:
+    """The folder of a run, and what it printed."""
+    folder, printed = tmp_path_factory.mktemp("optics"), StringIO()
+    with redirect_stdout(printed):
+        assert main(["optics", "--out", str(folder), "--quiet", "--json"]) == 0
+    return folder, printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def optics(told) -> Path:
+    return told[0]
 
 
 def test_optics_writes_its_figures(optics):
@@ -68,10 +77,9 @@ def test_optics_writes_its_figures(optics):
     assert "Fig. 3" in page
 
 
-def test_optics_tells_its_numbers(tmp_path, capsys):
-    code, printed, _ = run(capsys, "optics", "--out", tmp_path, "--json")
+def test_optics_tells_its_numbers(told):
+    folder, printed = told
     reported = json.loads(printed)
-    assert code == 0
     assert reported["threshold_voltage"] == {
         "value": pytest.approx(pi * sqrt(11.1e-12 / 1.2e-10)),
         "unit": "V",
@@ -90,10 +98,11 @@ def test_optics_tells_its_numbers(tmp_path, capsys):
     grating = [row for row in reported["grating_lobes"] if row["order"]]
     assert all(row["isotropic"] == pytest.approx(1.0) for row in grating)
     assert max(row["with_element"] for row in grating) == pytest.approx(0.4846, abs=1e-4)
-    assert json.loads((tmp_path / "optics.json").read_text())["chain"] == reported["chain"]
-    assert reported["report"] == str(tmp_path / "optics.html")
+    assert json.loads((folder / "optics.json").read_text())["chain"] == reported["chain"]
+    assert reported["report"] == str(folder / "optics.html")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_optics_of_another_array(tmp_path, capsys):
     words = ("--elements", 8, "--wavelength", 1e-6, "--pitch", 4e-7, "--targets", 12, "--voltages", 2.5, 0.5)
     code, printed, _ = run(
@@ -110,6 +119,7 @@ def test_optics_of_another_array(tmp_path, capsys):
     assert reported["chain"][-1]["voltage_V"] == pytest.approx(0.8 * pi / 1.257)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_optics_speaks_without_json(tmp_path, capsys):
     code, printed, _ = run(capsys, "optics", "--out", tmp_path, "--targets", 0, 10)
     assert code == 0
@@ -186,6 +196,7 @@ def test_identify_leaves_the_report_of_a_fit_alone(identified):
     assert sorted(path.name for path in identified.iterdir()) == names
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_identify_prints_a_table_and_json(study, tmp_path, capsys):
     code, printed, _ = run(capsys, "identify", study, *NARROW, "--out", tmp_path, "--json", "--quiet")
     assert code == 0
