@@ -293,7 +293,7 @@ def test_study_files(place, data):
 TEXTS_BY = {path.name: path.read_bytes() for path in CORPUS.glob("*.csv")}
 
 
-@many(0.05)
+@many(0.065)
 @given(data=mutated(*STUDIES))
 def test_files_of_candidates(place, data):
     path = place / "candidates.toml"
@@ -356,7 +356,7 @@ def run(tmp_path_factory) -> Path:
 def test_run_folders(run, tmp_path, name):
     shutil.copytree(run, tmp_path, dirs_exist_ok=True)
 
-    @many(0.005)
+    @many(0.0025)
     @given(data=mutated((run / name).read_bytes()))
     def read(data):
         (tmp_path / name).write_bytes(data)
@@ -376,7 +376,7 @@ def test_a_fit_on_blocks_without_bound_is_refused(run, tmp_path, refinement):
         load_result(tmp_path)
 
 
-@many(0.01)
+@many(0.005)
 @given(data=st.data())
 def test_values_of_a_fit(run, place, data):
     """Entries of the right file that hold something else."""
