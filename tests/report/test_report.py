@@ -273,6 +273,7 @@ def test_captions_carry_scores_and_mark_held_out_records(html):
     assert any("p\u00a0=\u00a03.2×10⁻⁷, not white" in c for c in captions)  # noqa: RUF001
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_grade_and_its_reason_are_said_once(tmp_path):
     text = page_with(tmp_path, verdict="Grade tentative: too few draws of time_1. More was learned.")
     box = text[text.index('<div class="verdict') : text.index("<nav ")]
@@ -403,6 +404,7 @@ def test_draws_of_another_run_are_refused(tmp_path):
         load_run(folder)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     folder = run_folder(tmp_path / "run")
     for name in ("residuals", "autocorrelation", "spectrum"):
@@ -411,6 +413,7 @@ def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     assert "too short" in section_of(write_report(folder).read_text(encoding="utf-8"), "residuals")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_of_many_records_the_least_white_residual_comes_first_and_others_are_folded(tmp_path, monkeypatch):
     shares = {"a": 0.5, "b": None, "c": 1e-4, "d": 0.03, "e": 0.9}
     monkeypatch.setitem(globals(), "RECORDS", tuple((name, False) for name in shares))
@@ -552,6 +555,7 @@ def page_with(tmp_path: Path, **more: object) -> str:
     return write_report(folder).read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_step_table_is_left_out_when_there_are_no_metrics(html, tmp_path):
     assert "<table>" in section_of(html, "step-responses")
     assert "<table>" not in section_of(page_with(tmp_path, step_metrics=[]), "step-responses")
@@ -562,6 +566,7 @@ def test_a_clause_becomes_a_sentence_once():
     assert stopped("on/off, 14 ms is best") == "on/off, 14 ms is best."
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_several_modes_are_shown_with_their_shares(html, tmp_path):
     assert "several modes" not in section_of(html, "parameters")
     modes = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
@@ -574,6 +579,7 @@ def test_several_modes_are_shown_with_their_shares(html, tmp_path):
     assert "run longer" in shown[6]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(html, tmp_path):
     shown = section_of(html, "prior-sensitivity")
     rows = rows_of(shown)
@@ -592,6 +598,7 @@ def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(html
     assert "<table>" not in none
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_page_of_importance_draws_speaks_of_no_ensembles(html, tmp_path):
     """Batches of weighted draws are no ensembles of walkers, and their evidence is no bridge."""
     assert "by bridge sampling" in section_of(html, "evidence")
@@ -603,6 +610,7 @@ def test_a_page_of_importance_draws_speaks_of_no_ensembles(html, tmp_path):
     assert "ensemble" not in "".join(shown)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fixed_parameter_is_not_called_sampled(tmp_path):
     folder = run_folder(tmp_path / "run")
     row = {"unit": "-", "prior": "x", "from": "study", "integrated_out": False}

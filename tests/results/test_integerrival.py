@@ -38,6 +38,7 @@ def test_every_free_order_is_held_at_its_nearest_integer_and_at_one_at_least(fit
     assert study.fit == fitted.study.fit
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_rival_predicts_the_same_records_and_is_reported(fitted, rival, tmp_path):
     reported = rival.as_json()
     assert [row["record"] for row in reported["held_out"]] == ["b"]

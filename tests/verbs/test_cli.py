@@ -26,7 +26,7 @@ DEVICE = Device(
 def record(tmp_path) -> Path:
     measured = simulate(
         DEVICE,
-        Bench(camera=0.2, noise_sd=0.02),
+        Bench(camera=0.4, noise_sd=0.02),
         on_off(1.0, hold=6.0, at=0.1),
         duration=14.0,
         name="pulse",
@@ -51,6 +51,7 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
     return code, out, err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, capsys):
     out = tmp_path / "run"
     code, printed, _ = run(capsys, "fit", study(record), "--out", out, "--json", "--quiet", "--jobs", 1)
@@ -75,6 +76,7 @@ def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, 
     assert json.loads(printed)["report"] == str(out / "report.html")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_records_alone_are_a_study(record, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, printed, _ = run(capsys, "fit", record, "--json", "--quiet", "--quick", "--jobs", 1)
