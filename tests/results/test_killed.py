@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.paper.staticoptics import OpticsPlan
 from lcopa_bayes.results.runfolder import LOCK, locked
 from lcopa_bayes.verbs.papers import optics
 
@@ -85,7 +86,7 @@ def test_what_a_killed_worker_was_writing_is_removed(tmp_path):
 
 
 def test_pages_are_not_written_while_another_run_writes(tmp_path):
-    result = optics()
+    result = optics(OpticsPlan(targets_deg=(0.0,), voltages=(2.0,)))
     result.save(tmp_path)
     child = subprocess.Popen([sys.executable, "-c", HOLDING, str(tmp_path)], stdout=subprocess.PIPE)
     try:
