@@ -196,6 +196,7 @@ def test_every_number_of_a_fit_that_is_doubted_is_lowered(checked, doubted):
     assert verdict(doubted).count("disagrees") == 1
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_shows_both_methods(checked, doubted, tmp_path):
     for made, word in ((checked, "agrees"), (doubted, "disagrees")):
         folder = tmp_path / word
@@ -217,6 +218,7 @@ def test_the_report_shows_both_methods(checked, doubted, tmp_path):
         load_run(folder)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_without_a_second_method_nothing_is_claimed(checked, tmp_path):
     alone = replace(checked, cross_check=None)
     assert results(alone)["cross_check"] is None
