@@ -23,6 +23,7 @@ from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.summary import results
 
 TINY = {"target_ess": 50}
+KNOWN = {"delay": 0.73, "order_1": 0.8}
 HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
 STEPS = Drive.steps(u=[(0.35, 0.8), (5.0, 0.1)], until=11.0)
 
@@ -223,12 +224,12 @@ def test_a_rest_at_negative_zero_is_zero():
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
-    return fit(study(record(), held_out=(HELD,), sampler=TINY))
+    return fit(study(record(), held_out=(HELD,), sampler=TINY, priors=KNOWN))
 
 
 @pytest.fixture(scope="module")
 def alone() -> Fit:
-    return fit(study(record(), sampler=TINY))
+    return fit(study(record(), sampler=TINY, priors=KNOWN))
 
 
 def test_a_record_scored_later_has_the_numbers_of_one_held_out_from_the_start(fitted, alone, tmp_path):
