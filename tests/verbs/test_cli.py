@@ -26,7 +26,7 @@ DEVICE = Device(
 def record(tmp_path) -> Path:
     measured = simulate(
         DEVICE,
-        Bench(camera=0.4, noise_sd=0.02),
+        Bench(camera=0.2, noise_sd=0.02),
         on_off(1.0, hold=6.0, at=0.1),
         duration=14.0,
         name="pulse",
