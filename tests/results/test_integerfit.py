@@ -24,12 +24,13 @@ from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.integerfit import IntegerFit, integer_fit
 
 LAG = TransferPath.of_times(1.0, 0.4, (2.0,), (1.0,))
+WHITE = {"kind": "white"}
 
 
-def fitted(path: TransferPath, terms: int) -> Fit:
+def fitted(path: TransferPath, terms: int, **settings: object) -> Fit:
     records = tuple(record(f"run{k}", (path,), 5 + k) for k in range(2))
     model = ModelSettings(terms=terms, share="none", delay="path")
-    return fit(Study("orders", None, "s", 3, records, (), model, noise={"kind": "white"}, sampler=QUICK))
+    return fit(Study("orders", None, "s", 3, records, (), model, sampler=QUICK, **settings))
 
 
 def parts(of: Fit) -> tuple[Alternatives, IntegerFit]:
@@ -49,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def over(folder: Path) -> Fit:
-    own = fitted(LAG, 1)
+    own = fitted(LAG, 1, noise=WHITE)
     return with_alternatives(own, integer_fit(own, folder=folder, quick=True))
 
 
@@ -95,7 +96,7 @@ def test_integer_orders_hold_what_free_ones_put_at_an_end() -> None:
 
 
 def test_a_fractional_order_leaves_no_integer_one() -> None:
-    assert integer_fit(fitted(HALF, 1)) is None
+    assert integer_fit(fitted(HALF, 1, noise=WHITE)) is None
 
 
 def test_a_killed_run_goes_on_from_what_was_sampled(
