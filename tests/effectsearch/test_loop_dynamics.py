@@ -44,13 +44,16 @@ def looped(study, library=LIBRARY):
 
 def test_a_second_lag_is_no_effect():
     """One term cannot have the zero of two lags, which an overdriven frame can imitate."""
-    study = lagged((0.6, 1.0), (0.4, 0.15))
-    found = looped(study)
-    assert looped(study, LIBRARY[:2]).names == ("overdrive_pulse",)  # where nothing better is offered
+    found = looped(lagged((0.6, 1.0), (0.4, 0.15)))
     assert found.names == ()
     assert found.verdict.kind == "unexplained"
     assert "linear dynamics" in found.verdict.sentence
     assert any(each.chosen.dynamics for each in found.rounds if each.chosen)
+
+
+@pytest.mark.slow
+def test_a_second_lag_is_an_overdriven_frame_where_nothing_better_is_offered():
+    assert looped(lagged((0.6, 1.0), (0.4, 0.15)), LIBRARY[:2]).names == ("overdrive_pulse",)
 
 
 def test_a_kick_after_falls_is_no_linear_dynamics():
