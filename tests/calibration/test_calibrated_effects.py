@@ -94,6 +94,7 @@ def test_tempering_begins_where_responses_are_bounded(problem):
     assert population.position.shape == (4, posterior.dimension)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_calibrate_with_an_effect_goes_to_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Truths are ranked, the effect's too; the page shows it; the same again from what is stored."""
     (tmp_path / "in").mkdir()

@@ -342,6 +342,7 @@ def test_the_bench_makes_a_fleet_of_a_known_population_with_odd_devices(tmp_path
     assert tomllib.loads((tmp_path / "device-001" / "study.toml").read_text())["model"] == {"terms": 1}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path):
     found = lb.fleet([lb.load_study(devices / "a")], "loop", quick=True, folder=tmp_path)
     (row,) = found.summary().to_dict("records")
