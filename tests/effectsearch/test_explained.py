@@ -178,6 +178,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the command line."""
     folder = tmp_path_factory.mktemp("made")
     source = study(2, curvature=0.08, held_out=1)
+    source = replace(source, fit=source.fit[:2])
     (folder / "in").mkdir()
     write_study(replace(source, name="made"), folder / "in" / "study.toml")
     arguments = ["loop", str(folder / "in"), "--out", str(folder / "run"), "--quick", "--jobs", "1"]
@@ -194,6 +195,7 @@ def test_the_command_writes_it(run: Path):
 
 
 @pytest.mark.parametrize("support", ["plant", pytest.param("both", marks=pytest.mark.slow), "lags"])
+@pytest.mark.usefixtures("undrawn")
 def test_the_page_says_over_which_plants_its_numbers_are(run: Path, tmp_path: Path, support: str):
     """Gains and delays are over sums of lags too, unless the records do not support these."""
     folder = Path(shutil.copytree(run, tmp_path / "run"))

@@ -332,6 +332,7 @@ def test_a_filled_template_is_a_record(one, tmp_path):
     np.testing.assert_array_equal(read.drive, clean.drive)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_plan_is_numbers_a_page_and_a_drive(one, tmp_path):
     made = design_next(fitted(one), quick=True, bench_time=60.0)
     made.report(tmp_path)

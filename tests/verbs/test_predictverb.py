@@ -142,6 +142,7 @@ def test_a_missing_drive_or_folder_is_reported(folder, capsys):
     assert "there is no such run folder" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_of_a_prediction_and_zero_offset(fitted, folder, tmp_path):
     path = plan(folder, GOOD)
     assert (
