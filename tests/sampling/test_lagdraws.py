@@ -65,7 +65,7 @@ def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]
         assert own.std() == pytest.approx(sd, rel=0.25)
 
 
-@pytest.mark.parametrize("spare", [0, 1])
+@pytest.mark.parametrize("spare", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_intervals_hold_what_made_the_records(spare: int) -> None:
     held = []
     for seed in range(4):

@@ -293,7 +293,7 @@ def test_the_draws_have_the_marginals_of_quadrature(delay_and_sigma):
     assert abs(np.median(found.values[:, gain]) - TRUTH["gain"]) < 4 * found.values[:, gain].std()
 
 
-@pytest.mark.parametrize("alike", [True, False])
+@pytest.mark.parametrize("alike", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_evidence_is_of_the_prior_with_decreasing_orders(alike):
     """Against the mean likelihood of prior draws; noise so large that these find the posterior."""
     posterior = made(2, alike=alike)
