@@ -79,7 +79,7 @@ def calibration() -> lb.CalibrationResult:
 
 @pytest.fixture(scope="module")
 def fleet() -> lb.FleetResult:
-    one = {"terms": 1, "noise": NOISE, "sampler": TINY, "priors": FIXED, "seed": 5}
+    one = {"terms": 1, "noise": NOISE, "priors": FIXED, "seed": 5}
     return lb.fleet([lb.Study("a", fit=[ON], **one), lb.Study("b", fit=[OFF], **one)])
 
 
@@ -150,7 +150,7 @@ SHORTER = {
 
 def bent_lag(height: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """A first-order lag of 2 ms under a step, read by a sensor that adds a part of the cube."""
-    time_ms = np.arange(-15.0, 12.0, 0.5)
+    time_ms = np.arange(-15.0, 12.0, 0.25)
     lag = height * -np.expm1(-np.maximum(time_ms, 0) / 2)
     reading = lag + 0.04 * lag**3 + 0.003 * rng.normal(size=time_ms.size)
     return {"time_ms": time_ms, "drive_x_rad": height * (time_ms >= 0), "response_x_rad": reading}
@@ -200,7 +200,7 @@ def test_the_lines_that_must_work(tmp_path, monkeypatch):
     ]
     # the effect that the records hold is named, and with it the time constant is that of the lag
     assert names["search"].study.effects.use == better.study.effects.use == ("odd_curvature",)
-    assert tables[1]["log_evidence"].diff().iloc[1] > 50
+    assert tables[1]["log_evidence"].diff().iloc[1] > 100
     times = {one: names[one].summary().set_index("parameter").loc["time_1"] for one in ("fit", "better")}
     assert times["fit"]["lower"] > 2.03
     assert times["better"]["lower"] < 2.01
@@ -296,9 +296,8 @@ def test_a_result_is_the_same_when_read_back(name, request, tmp_path):
     before = page.read_bytes()
     read.save(tmp_path / "copy")
     assert lb.load_result(tmp_path / "copy").to_json() == values
-    if name not in ("fit", "audit", "loop"):  # whose pages are drawn again from one folder below
-        page.unlink()
-        assert read.report(tmp_path / "run").read_bytes() == before
+    page.unlink()
+    assert read.report(tmp_path / "run").read_bytes() == before
 
 
 def test_a_design_and_a_loop_read_back_hold_drive_and_study(design, loop, tmp_path):

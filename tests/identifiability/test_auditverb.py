@@ -25,7 +25,6 @@ fit = ["one.csv"]
 terms = 2
 orders = [0.8, 0.8]
 [priors]
-delay = 0.73
 gain = { dist = "uniform", loc = 0, scale = 10 }
 [noise]
 kind = "white"
@@ -56,7 +55,7 @@ def run(study) -> Path:
 def test_audit_tells_what_other_tools_rely_on(run):
     reported = json.loads((run / "audit.json").read_text())
     rows = {row["name"]: row for row in reported["parameters"]}
-    assert set(rows) == {"gain", "time_1", "time_2", "offset", "sigma"}
+    assert set(rows) == {"gain", "time_1", "time_2", "delay", "offset", "sigma"}
     for row in rows.values():
         assert row["verdict"] in VERDICTS
         assert row["reason"]
@@ -65,7 +64,7 @@ def test_audit_tells_what_other_tools_rely_on(run):
     merged = [rows[name]["verdict"] for name in ("time_1", "time_2")]
     assert merged == ["structurally unidentifiable"] * 2  # the search sees that only T1^0.8 + T2^0.8 acts
     assert rows["time_1"]["partners"][0] == "time_2"
-    assert [rows[name]["verdict"] for name in ("gain", "sigma")] == ["identified"] * 2
+    assert [rows[name]["verdict"] for name in ("gain", "delay", "sigma")] == ["identified"] * 3
     assert reported["verdict"].startswith("Given this model, ")
     assert reported["limitations"] == json.loads((run / "results.json").read_text())["limitations"]
     assert reported["spectrum"][-1]["prior_knows_more"]
@@ -100,7 +99,7 @@ def test_claims_read_an_audit(run, tmp_path, capsys):
     rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["claims"]}
     assert rows["I1"]["verdict"] == "undecided"  # orders are fixed: there is no printed form to look at
     assert [rows[claim]["verdict"] for claim in ("I2", "I3", "I4")] == ["contradicted"] * 3
-    assert rows["I4"]["number"] == pytest.approx(1 / 3)
+    assert rows["I4"]["number"] == pytest.approx(2 / 4)
     assert rows["I6"]["verdict"] == "undecided"
     assert "one path" in rows["I6"]["how"]
 

@@ -492,17 +492,17 @@ def test_commands_of_other_heights_and_times_share_what_was_read(exposure):
     dynamics = Dynamics((np.array([KELVIN[0]]),), (np.array([KELVIN[1]]),), np.array([[0.4]]))
     known = {}
     drives = [
-        AxisDrive(np.array([0.0, 3.1]), np.array(heights) * sign)
+        AxisDrive(np.array([0.0, 3.1, 9.27]), np.array(heights) * sign)
         for sign in (1.0, -2.0)
-        for heights in ([1.0, -0.5], [2.0, 1.0])
+        for heights in ([1.0, -0.5, 0.25], [2.0, 1.0, -1.0])
     ]
-    drives.append(AxisDrive(np.array([0.0, 3.100001]), np.array([1.0, -0.5])))
+    drives.append(AxisDrive(np.array([0.0, 3.100001, 9.27]), np.array([1.0, -0.5, 0.25])))
     for drive in drives:
         model = single(drive, times, 2, exposure=exposure)
         shared = model.unit_responses(dynamics, known)[0]
         assert_allclose(shared, model.unit_responses(dynamics)[0], rtol=0, atol=1e-14)
     (response,) = known.values()
-    assert len(response.readings) == 3  # of two changes, and of one that is later by a millionth
+    assert len(response.readings) == 4  # of three changes, and of one that is later by a millionth
 
 
 def test_readings_are_not_kept_of_many_plants():

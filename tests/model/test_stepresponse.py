@@ -188,11 +188,13 @@ def test_phases_hold_every_change(rng):
         assert all((np.diff(part.blocks) > 0).all() for part in parts)
 
 
-def test_small_changes_added_to_a_drive_leave_the_rest_as_it_is(rng):
+@pytest.mark.parametrize("irregular", [False, True])
+def test_small_changes_added_to_a_drive_leave_the_rest_as_it_is(irregular, rng):
     """Of 20 changes and 20 of a millionth of their size, read at samples of any spacing, not all are kept
     apart; the response is linear."""
     times, at = np.arange(0.0, 20.0, 0.1), np.cumsum(rng.uniform(0.3, 0.9, 20))
-    times[1:-1] += rng.uniform(-0.03, 0.03, times.size - 2)
+    if irregular:
+        times[1:-1] += rng.uniform(-0.03, 0.03, times.size - 2)
     jumps, small = rng.choice([-1.0, 1.0], 20), 1e-6 * rng.normal(size=20)
     late = at + 0.1234 + rng.uniform(0.0, 0.2, 20)
     both = AxisDrive.of_jumps(np.concatenate((at, late)), np.concatenate((jumps, small)))
