@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import Look, Search
+from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -54,7 +54,7 @@ class Base(NamedTuple):
     """What was changed; empty when nothing was."""
     richer: tuple[Base, ...] = ()
     """Plants that contain it and were not chosen."""
-    look: Look | None = None
+    look: Round | None = None
     """What it leaves; None where nobody looked yet."""
 
 
@@ -289,9 +289,9 @@ def _named(
 
 def _look(
     base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
-) -> Look:
+) -> Round:
     quiet = base.fit.noise_samples
-    return Look(trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew))
+    return Round(trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew))
 
 
 def _explained(

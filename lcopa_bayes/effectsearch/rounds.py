@@ -48,40 +48,28 @@ _PAIRS = 2
 
 @final
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What a state leaves, and its candidates once they are refitted."""
-
-    trace: Trace
-    refits: tuple[Refit, ...] | None = None
-    """By falling evidence; None before there are any."""
-    failures: tuple[str, ...] = ()
-    """Candidates that could not be refitted, and why."""
-
-    def refitted(self, state: State, crew: Crew, rival: float = -np.inf) -> Look:
-        """With the candidates of the state refitted, those far below a `rival` [nat] not to the end."""
-        if self.refits is not None:
-            return self
-        refits, failures = refitted(state, self.trace, crew, rival)
-        return Look(self.trace, tuple(refits), tuple(failures))
-
-    @property
-    def leading(self) -> Refit | None:
-        """The single named effect of most evidence that would be accepted; None without any."""
-        likely = accepted(self.refits or (), self.trace, self.trace.threshold)
-        return next((one for one in likely if not one.dynamics), None)
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class Round:
     """One look at a residual."""
 
     trace: Trace
-    refits: tuple[Refit, ...]
-    """Leading candidates with everything free, by falling evidence."""
-    failures: tuple[str, ...]
+    refits: tuple[Refit, ...] = ()
+    """Leading candidates with everything free, by falling evidence; none before they are refitted."""
+    failures: tuple[str, ...] = ()
     """Candidates that could not be refitted, and why."""
-    chosen: Refit | None
+    chosen: Refit | None = None
+
+    def refitted(self, state: State, crew: Crew, rival: float = -np.inf) -> Self:
+        """With the candidates of the state refitted, those far below a `rival` [nat] not to the end."""
+        if self.refits or self.failures:
+            return self
+        refits, failures = refitted(state, self.trace, crew, rival)
+        return replace(self, refits=tuple(refits), failures=tuple(failures))
+
+    @property
+    def leading(self) -> Refit | None:
+        """The single named effect of most evidence that would be accepted; None without any."""
+        likely = accepted(self.refits, self.trace, self.trace.threshold)
+        return next((one for one in likely if not one.dynamics), None)
 
     @property
     def largest(self) -> float:
@@ -145,7 +133,7 @@ def search(
     noise_samples: Sequence[int],
     draws: int,
     alone: bool = False,
-    first: Look | None = None,
+    first: Round | None = None,
     crew: Crew = ALONE,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
@@ -156,22 +144,22 @@ def search(
     for number in range(MOST + 1):
         look = first if first is not None and not number else None
         if look is None:
-            look = Look(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
+            look = Round(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
         seen = look.trace
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
-            rounds.append(Round(seen, (), (), None))
+            rounds.append(Round(seen))
             break
         beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
         crew.stage(f"refitting with each effect that comes into question{beside}")
         look = look.refitted(state, crew)
-        refits = look.refits or ()
+        refits = look.refits
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
         likely = [one for one in accepted(refits, seen, bar) if not alone or _large(one)]
         chosen = _leader(_beside_dynamics(likely, [one for one in refits if one.dynamics]))
         if chosen is not None and chosen.dynamics and groups:
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
-        rounds.append(Round(seen, refits, look.failures, chosen))
+        rounds.append(replace(look, chosen=chosen))
         if chosen is None:
             break
         if not chosen.dynamics:
@@ -183,7 +171,7 @@ def search(
         if paired is not None:
             state = paired.state
             seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
-            rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
+            rounds += [Round(rounds[0].trace, (paired,), chosen=paired), Round(seen)]
     names = [effect.name for effect in state.model.effects]
     confounded = tuple(groups.get(name, (name,)) for name in names)
     gained, dropped = _gained(start, state, float(sum(noise_samples)))

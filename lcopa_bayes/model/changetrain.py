@@ -59,9 +59,10 @@ def superposed(
     `StepResponse.on_lattice`, and rounding of the largest reading.
     """
     placed = _Placed.of(trains, circle.n)
-    weights = placed.weights(kind)
+    around = taps(placed.theta, kind)
+    weights = placed.weights(around, kind)
     total = fft.irfft(spectrum[:, None] * plain_spectrum(weights, circle), circle.length)[..., : placed.n]
-    placed.correct(total, response, kind)
+    placed.correct(total, response, around, kind)
     out = []
     for number, train in enumerate(trains):
         read = np.zeros((*response.coarse.shape[:2], train.samples))
@@ -116,25 +117,25 @@ class _Placed:
         first = int(self.first[train])
         return max(0, SIDE - first), max(0, first - SIDE)
 
-    def weights(self, kind: Kind) -> Array:
-        """Weights of the block means in the readings, (trains, batch, n)."""
+    def weights(self, around: Array, kind: Kind) -> Array:
+        """Weights of the block means in the readings, (trains, batch, n), from those of the means `around` a
+        reading, (5, changes, batch)."""
         shifts = np.arange(2 * SIDE, -1, -1)[:, None, None]
-        train = self._sums(self.place + shifts, self.jumps[:, None] * taps(self.theta, kind))
+        train = self._sums(self.place + shifts, self.jumps[:, None] * around)
         if kind == "integral":
             whole = np.broadcast_to(self.jumps[:, None], self.place.shape)
             train += np.cumsum(self._sums(self.place + SIDE + 1, whole), axis=-1)
         return train
 
-    def correct(self, total: Array, response: StepResponse, kind: Kind) -> None:
+    def correct(self, total: Array, response: StepResponse, around: Array, kind: Kind) -> None:
         """Add to readings by block means alone, (rows, trains, batch, n), what those right after each onset
-        differ by, and make those before the first one zero."""
+        differ by, and make those before the first one zero; `around` as in `weights`."""
         rows, batch = len(total), self.place.shape[1]
         head = np.zeros((rows, batch, 2 * SIDE + _TOUCHED))
         means = response.coarse[:, :, :_TOUCHED]
         head[:, :, 2 * SIDE : 2 * SIDE + means.shape[2]] = means
-        around = sliding_window_view(head, 2 * SIDE + 1, axis=2)[:, None]
-        weights = np.moveaxis(taps(self.theta, kind), 0, -1)[..., None]
-        beyond = -np.matmul(around, weights)[..., 0]
+        windows = sliding_window_view(head, 2 * SIDE + 1, axis=2)[:, None]
+        beyond = -np.matmul(windows, np.moveaxis(around, 0, -1)[..., None])[..., 0]
         if kind == "integral":
             beyond[..., SIDE:] -= np.cumsum(head[:, None, :, 2 * SIDE - 1 : -SIDE - 1], axis=-1)
         beyond[..., SIDE:] += response.near(self.theta[..., None] + np.arange(NEAR), kind)

@@ -14,10 +14,10 @@ from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import Circle
-from lcopa_bayes.model.grid import Lattice, Mesh
+from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response
-from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
+from lcopa_bayes.model.superposition import Changes, Phase, Superposition, blocks_of, phases
 
 if TYPE_CHECKING:
     from lcopa_bayes.model.effects.declared import Declared
@@ -120,6 +120,11 @@ class Experiment:
         return tuple(apart(drive) if drive.moves else () for drive in self.drives)
 
     @cached_property
+    def changes(self) -> tuple[Changes, ...]:
+        """The same, with the lattice of the samples."""
+        return tuple(Changes(own, self.mesh.lattice) for own in self.phases)
+
+    @cached_property
     def blocks(self) -> int:
         """Blocks of the step responses that simulate the record."""
         begins = [float(drive.times[0]) for drive in self.drives if drive.moves]
@@ -196,7 +201,7 @@ class ForwardModel:
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
         for index, (element, delay, axis) in enumerate(self.layout.units):
             proportional: list[tuple[int, float, Array]] = []
-            for step, moved in self._moved(axis).items():
+            for step, moved in self._moved[axis].items():
                 own = []
                 for number in moved:
                     place, place_axis, scale = self._alike[number][axis]
@@ -210,25 +215,22 @@ class ForwardModel:
                 if not own:
                     continue
                 response = self._step_response(dynamics, element, step, known)
-                late, records = dynamics.delays[:, delay], self._driven(own, axis)
+                late, records = dynamics.delays[:, delay], [self.experiments[k].changes[axis] for k in own]
                 found = superposed[step](response, records, late, (element, delay))
                 for number, (value,) in zip(own, found, strict=True):
                     out[number][index][:, self.experiments[number].mesh.reading.first :] = value
             for number, scale, one in proportional:
                 np.multiply(scale, one, out=out[number][index])
 
-    def _moved(self, axis: int) -> dict[float, list[int]]:
-        """Records in which a drive moves, by the width of their blocks."""
-        moved: dict[float, list[int]] = {}
+    @cached_property
+    def _moved(self) -> list[dict[float, list[int]]]:
+        """Records in which each drive moves, by the width of their blocks."""
+        moved: list[dict[float, list[int]]] = [{} for _ in self.layout.drives]
         for number, experiment in enumerate(self.experiments):
-            if experiment.phases[axis]:
-                moved.setdefault(experiment.mesh.lattice.step, []).append(number)
+            for own, changes in zip(moved, experiment.phases, strict=True):
+                if changes:
+                    own.setdefault(experiment.mesh.lattice.step, []).append(number)
         return moved
-
-    def _driven(self, records: Sequence[int], axis: int) -> list[tuple[tuple[Phase, ...], Lattice]]:
-        """Changes of a drive in some records, and where their samples lie."""
-        some = (self.experiments[number] for number in records)
-        return [(one.phases[axis], one.mesh.lattice) for one in some]
 
     def _step_response(
         self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: Slopes = None
@@ -305,9 +307,9 @@ class ForwardModel:
             terms = dynamics.times[element].shape[1]
             for own, size in zip(slopes, sizes, strict=True):
                 own.append(np.zeros((2 * terms + 1, batch, size)))
-            for step, moved in self._moved(axis).items():
+            for step, moved in self._moved[axis].items():
                 response = self._step_response(dynamics, element, step, known, slopes=wanted)
-                records, late = self._driven(moved, axis), dynamics.delays[:, delay]
+                records, late = [self.experiments[k].changes[axis] for k in moved], dynamics.delays[:, delay]
                 superpose = partial(superposed[step], records=records, delays=late, key=(element, delay))
                 found, by_block = superpose(response), superpose(response.alone, kind="slope")
                 for number, rows, slope in zip(moved, found, by_block, strict=True):

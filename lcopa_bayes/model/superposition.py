@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from math import ceil
 from typing import final
 
@@ -39,6 +39,8 @@ _HELD = 1 << 19
 _APART = 6
 """Places of the samples in a block after phases of few changes up to which each is read by itself [-]; more
 are convolved together. With 24 that takes a third of the time, with 3 a seventh more."""
+_INTEGRATED: dict[Kind, Kind] = {"value": "integral", "slope": "value"}
+"""What the mean over an exposure is a difference of."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -127,6 +129,36 @@ def blocks_of(lattice: Lattice, begin: float) -> int:
 
 @final
 @dataclass(frozen=True, eq=False)
+class Changes:
+    """Changes of one drive of a record, and where its samples lie: all that does not depend on a plant."""
+
+    phases: tuple[Phase, ...]
+    lattice: Lattice
+
+    @cached_property
+    def dense(self) -> tuple[Phase, ...]:
+        """Phases of many changes."""
+        return tuple(phase for phase in self.phases if phase.blocks.size > _ADDED)
+
+    @cached_property
+    def sparse(self) -> tuple[Vector, Vector]:
+        """Times [time unit] and sizes [drive unit] of all changes of the other phases, (changes,) each."""
+        few = [phase for phase in self.phases if phase.blocks.size <= _ADDED]
+        nothing = [np.empty(0)]
+        times = nothing + [phase.time + self.lattice.step * phase.blocks for phase in few]
+        return np.concatenate(times), np.concatenate(nothing + [phase.jumps for phase in few])
+
+    @cached_property
+    def places(self) -> frozenset[int]:
+        """Places in a block that samples have after the latter, where they are equidistant."""
+        if self.lattice.slots is None or not self.lattice.times.size:
+            return frozenset()
+        lags = (self.lattice.times[0] - self.sparse[0]) / self.lattice.step % 1.0
+        return frozenset((np.round(lags / _SAME_PHASE).astype(int) % _PLACES).tolist())
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class _Read:
     """A step response on the lattice of a record."""
 
@@ -174,7 +206,7 @@ class Superposition:
     def __call__(
         self,
         response: StepResponse,
-        records: Sequence[tuple[Sequence[Phase], Lattice]],
+        records: Sequence[Changes],
         delays: Vector,
         key: tuple[int, int],
         kind: Kind = "value",
@@ -186,23 +218,24 @@ class Superposition:
         `response` and `delays`; kind "slope" reads the derivative per block instead.
         """
         shape = response.coarse.shape[:2]
-        out = [np.zeros((*shape, lattice.times.size)) for _, lattice in records]
-        scattered: dict[float, list[tuple[Array, Sequence[Phase], Lattice]]] = {}
-        apart = _places(records) > _APART
-        for target, (changes, lattice) in zip(out, records, strict=True):
+        out = [np.zeros((*shape, changes.lattice.times.size)) for changes in records]
+        scattered: dict[float, list[tuple[Array, Changes]]] = {}
+        apart = len(frozenset().union(*(changes.places for changes in records))) > _APART
+        for target, changes in zip(out, records, strict=True):
+            lattice, one_by_one = changes.lattice, changes.phases
             if not lattice.times.size:
                 continue
             if lattice.slots is None:
-                self._add_anywhere(target, response, changes, lattice, delays, kind)
+                self._add_anywhere(target, response, changes, delays, kind)
                 continue
-            few = [phase for phase in changes if apart and phase.blocks.size <= _ADDED]
-            if few:
-                scattered.setdefault(lattice.exposure, []).append((target, few, lattice))
-                changes = [phase for phase in changes if phase.blocks.size > _ADDED]
-            begins = np.array([phase.time for phase in changes])
+            if apart:
+                one_by_one = changes.dense
+                if changes.places:
+                    scattered.setdefault(lattice.exposure, []).append((target, changes))
+            begins = np.array([phase.time for phase in one_by_one])
             origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
             for phase, origin, read in zip(
-                changes, origins, self._reads(response, origins, lattice, key, kind), strict=True
+                one_by_one, origins, self._reads(response, origins, lattice, key, kind), strict=True
             ):
                 self._add_on_lattice(target, phase, origin, read, lattice)
         together = max(1, _TOGETHER // (self.circle.n * shape[0] * shape[1]))
@@ -213,7 +246,7 @@ class Superposition:
 
     def _add_scattered(
         self,
-        records: Sequence[tuple[Array, Sequence[Phase], Lattice]],
+        records: Sequence[tuple[Array, Changes]],
         response: StepResponse,
         delays: Vector,
         element: int,
@@ -221,47 +254,38 @@ class Superposition:
     ) -> None:
         """Add the response to many phases of few changes at equidistant sample times of one exposure."""
         trains = []
-        for _, changes, lattice in records:
+        for _, changes in records:
+            lattice, (times, jumps) = changes.lattice, changes.sparse
             assert lattice.slots is not None
-            times = np.concatenate([phase.time + lattice.step * phase.blocks for phase in changes])
-            jumps = np.concatenate([phase.jumps for phase in changes])
             origins = (lattice.times[0] - times[:, None] - delays) / lattice.step
             trains.append(Train(origins, jumps, int(lattice.slots[-1]) + 1))
         rows = len(response.coarse)
         if element not in self.spectra or len(self.spectra[element]) < rows:
             self.spectra[element] = plain_spectrum(response.coarse, self.circle)
         read = partial(superposed, response, self.spectra[element][:rows], self.circle)
-        width = records[0][2].exposure / records[0][2].step
+        width = lattice.exposure / lattice.step
         if width == 0.0:
             found = read(trains, kind)
         else:
-            before: Kind = "value" if kind == "slope" else "integral"
-            late, early = read(trains, before), read([train.earlier(width) for train in trains], before)
+            late = read(trains, _INTEGRATED[kind])
+            early = read([train.earlier(width) for train in trains], _INTEGRATED[kind])
             found = [(one - other) / width for one, other in zip(late, early, strict=True)]
-        for (target, _, lattice), readings in zip(records, found, strict=True):
-            target += readings[..., lattice.chosen]
+        for (target, changes), readings in zip(records, found, strict=True):
+            target += readings[..., changes.lattice.chosen]
 
     def _add_anywhere(
         self,
         out: Array,
         response: StepResponse,
-        changes: Sequence[Phase],
-        lattice: Lattice,
+        changes: Changes,
         delays: Vector,
         kind: Kind,
     ) -> None:
         """Add the response to the changes at sample times of any spacing."""
-        times, jumps = [], []
-        for phase in changes:
-            if phase.blocks.size > _ADDED:
-                onset = phase.time + delays[:, None]
-                out += _read_anywhere(self._convolved(response, phase), lattice, onset, kind)
-            else:
-                times.append(phase.time + lattice.step * phase.blocks)
-                jumps.append(phase.jumps)
-        if not times:
-            return
-        every, jump = np.concatenate(times), np.concatenate(jumps)
+        lattice, (every, jump) = changes.lattice, changes.sparse
+        for phase in changes.dense:
+            onset = phase.time + delays[:, None]
+            out += _read_anywhere(self._convolved(response, phase), lattice, onset, kind)
         rows, batch, samples = out.shape
         together = max(1, _TOGETHER // out.size)
         for first in range(0, every.size, together):
@@ -322,19 +346,6 @@ class Superposition:
         return [self.kept[place] for place in places]
 
 
-def _places(records: Sequence[tuple[Sequence[Phase], Lattice]]) -> int:
-    """How many places in a block the equidistant samples of some records have after phases of few
-    changes [-]."""
-    lags = [
-        (lattice.times[0] - phase.time) / lattice.step
-        for changes, lattice in records
-        if lattice.slots is not None and lattice.times.size
-        for phase in changes
-        if phase.blocks.size <= _ADDED
-    ]
-    return len({round(float(lag % 1.0) / _SAME_PHASE) % _PLACES for lag in lags})
-
-
 def _read_anywhere(response: StepResponse, lattice: Lattice, onsets: Matrix, kind: Kind) -> Array:
     """Readings of a step response after each onset, (batch, changes) [time unit], at sample times of any
     spacing, (rows, batch, changes * samples)."""
@@ -342,8 +353,7 @@ def _read_anywhere(response: StepResponse, lattice: Lattice, onsets: Matrix, kin
     if lattice.exposure == 0.0:
         return response.at(x, kind)
     width = lattice.exposure / lattice.step
-    before: Kind = "value" if kind == "slope" else "integral"
-    return (response.at(x, before) - response.at(x - width, before)) / width
+    return (response.at(x, _INTEGRATED[kind]) - response.at(x - width, _INTEGRATED[kind])) / width
 
 
 def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: Kind) -> Array:
@@ -353,11 +363,10 @@ def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: K
         readings = response.on_lattice(theta, kind)
     else:
         width = lattice.exposure / lattice.step
-        before: Kind = "value" if kind == "slope" else "integral"
-        late = response.on_lattice(theta, before)
+        late = response.on_lattice(theta, _INTEGRATED[kind])
         opened = theta - width
         whole = np.floor(opened)
-        early = response.on_lattice(opened - whole, before)
+        early = response.on_lattice(opened - whole, _INTEGRATED[kind])
         # the shutter opens whole blocks before the block in which it closes
         for k, blocks in np.ndenumerate(np.minimum(-whole, early.shape[-1]).astype(int)):
             late[:, *k, blocks:] -= early[:, *k, : early.shape[-1] - blocks]

@@ -28,6 +28,8 @@ from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
+_BENDING = (ElementEffect, ForceEffect, SensorEffect)
+"""Those between commands and reading."""
 _TOGETHER = 1 << 18
 """Plants times blocks that are simulated at once [-]."""
 
@@ -135,7 +137,7 @@ class Simulator:
         return (self._kept if acts else self.still).get_or(key, lambda: self._simulated(plant, psi))
 
     def _simulated(self, plant: Plant, psi: Vector) -> list[Moved]:
-        acting = self._bending(psi)
+        acting = self._acts(psi, _BENDING)
         scenes = self.scenes(plant, psi)
         model = self.driven(scenes)
         if any(acting):
@@ -183,7 +185,7 @@ class Simulator:
         them on elements or before the sensor."""
         alike: dict[tuple[bool, ...], list[int]] = {}
         for k, (_, psi) in enumerate(cases):
-            alike.setdefault(tuple(self._upstream(psi)), []).append(k)
+            alike.setdefault(tuple(self._acts(psi, UPSTREAM)), []).append(k)
         out: dict[int, list[Moved]] = {}
         longest = max(experiment.mesh.grid.n for experiment in self.model.experiments)
         size = max(1, _TOGETHER // longest)
@@ -203,23 +205,16 @@ class Simulator:
                 out |= dict(zip(some, found, strict=True))
         return [out[k] for k in range(len(cases))]
 
-    def _upstream(self, psi: Vector) -> list[bool]:
-        """Of each effect, whether it acts before the reading."""
+    def _acts(self, psi: Vector, places: tuple[type[Effect], ...]) -> list[bool]:
+        """Of each effect, whether it acts, at one of some places."""
         return [
-            isinstance(effect, UPSTREAM) and bool(psi[part].any())
-            for effect, part in zip(self.effects, self._slices, strict=True)
-        ]
-
-    def _bending(self, psi: Vector) -> list[bool]:
-        """Of each effect, whether it acts between commands and reading."""
-        return [
-            isinstance(effect, (ElementEffect, ForceEffect, SensorEffect)) and bool(psi[part].any())
+            isinstance(effect, places) and bool(psi[part].any())
             for effect, part in zip(self.effects, self._slices, strict=True)
         ]
 
     def bends(self, psi: Vector) -> bool:
         """Whether anything acts between commands and reading, so that the forward model does not hold."""
-        return any(self._bending(psi))
+        return any(self._acts(psi, _BENDING))
 
     def _acting(self, acting: Sequence[bool], psi: Vector, record: int) -> list[tuple[Effect, Vector]]:
         """Effects that act before the reading, with their coefficients on a record."""
