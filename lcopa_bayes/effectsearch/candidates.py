@@ -61,8 +61,8 @@ def refitted(
     """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
     Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
-    from the size of their prior. So are the classes of linear dynamics, which a name must beat. What a first
-    descent leaves far below a `rival` [nat] is not refitted to the end.
+    from the size of their prior. So are the classes of linear dynamics, which a name must beat, if any name
+    reaches a `rival` [nat]. What a first descent leaves far below that is not refitted to the end.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
     worth = {one.name: one.signature for one in named if one.log_bayes_factor > 0}
@@ -85,8 +85,13 @@ def refitted(
             sizes[one.name] = worth[one.name].amplitude(seen.residual, seen.scale)
     known = crew.sharing((state, least if seen.alarmed else np.inf, far, _REACH * rival))
     # of the trace a task needs one effect
-    tasks = [(replace(seen, traced=(seen.of(name),)), amplitude) for name, amplitude in sizes.items()]
-    ends = dict(zip(sizes, known.each(_refitted, tasks), strict=True))
+    tasks = {name: (replace(seen, traced=(seen.of(name),)), size) for name, size in sizes.items()}
+    dynamics = {name: task for name, task in tasks.items() if seen.of(name).card.dynamics}
+    names = {name: task for name, task in tasks.items() if name not in dynamics}
+    ends = dict(zip(names, known.each(_refitted, list(names.values())), strict=True))
+    done = [end for end in ends.values() if isinstance(end, Refit)]
+    if rival == -np.inf or state.whitening.dependence or any(one.log_bayes_factor >= rival for one in done):
+        ends |= zip(dynamics, known.each(_refitted, list(dynamics.values())), strict=True)
     done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
     failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
     return under_one_noise(done), failures

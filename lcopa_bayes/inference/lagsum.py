@@ -19,10 +19,11 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from scipy.linalg import eigh, orth
+from scipy.linalg import orth, solve_triangular
+from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -39,7 +40,7 @@ _INSTANT = 0.02
 WEIGHT = 1.0
 """Prior standard deviation of a weight, in ranges of response over ranges of drive [-]."""
 _VISIBLE = 1e-4
-"""Squared whitened response below which a direction is left out [-]."""
+"""Squared part of a whitened response per unit weight that may be in no direction that is kept [-]."""
 _SAMPLES = 4_000
 """Most samples of a response axis: of more one in so many is used, which widens intervals."""
 _VALUES = 4_000_000
@@ -225,7 +226,7 @@ def lag_table(
     if len(joined) > count + 1:
         basis = orth(_unit_rows(joined[count:-1]).T)
         joined = joined - (joined @ basis) @ basis.T
-    reduced, target = _reduced(joined[:count], joined[-1])
+    reduced, target = _reduced(joined[:count].reshape(len(drives), -1, joined.shape[1]), joined[-1])
     remainder = max(0.0, float(joined[-1] @ joined[-1] - target @ target))
     shape = (1, len(drives), log_times.size, delays.shape[1], -1)
     shortest = float(np.log(_SHORTEST * scales.period))
@@ -261,13 +262,19 @@ def _columns(
     return [one.reshape(len(drives) * batch, -1) for one in out]
 
 
-def _reduced(columns: Matrix, target: Vector) -> tuple[Matrix, Vector]:
-    """Columns (columns, samples) and target in the principal directions of the columns that show."""
-    if columns.shape[0] < columns.shape[1]:
-        squares, vectors = eigh(columns @ columns.T)
-        kept = squares > _VISIBLE
-        roots = np.sqrt(squares[kept])
-        return vectors[:, kept] * roots, vectors[:, kept].T @ (columns @ target) / roots
-    squares, vectors = eigh(columns.T @ columns)
-    kept = squares > _VISIBLE
-    return columns @ vectors[:, kept], vectors[:, kept].T @ target
+def _reduced(columns: Array, target: Vector) -> tuple[Matrix, Vector]:
+    """Columns (paths, columns, samples), all in one row, and target in the directions in which they differ by
+    more than shows: those of a few columns, found of each path first and then of all."""
+    apart = [own[_pivots(own)[0]] for own in columns]
+    rows = np.concatenate(apart)
+    chosen, factor = _pivots(rows)
+    basis = solve_triangular(factor, rows[chosen], lower=True)
+    return columns.reshape(-1, target.size) @ basis.T, basis @ target
+
+
+def _pivots(rows: Matrix) -> tuple[Index, Matrix]:
+    """Rows between which all others lie but for what does not show, and the lower triangular factor of their
+    products: a Cholesky factorisation with pivoting that ends there (Harbrecht, Peters and Schneider 2012,
+    Appl. Numer. Math. 62)."""
+    factor, places, rank, _ = dpstrf(rows @ rows.T, tol=_VISIBLE, lower=1)
+    return places[:rank] - 1, np.tril(factor[:rank, :rank])

@@ -32,6 +32,8 @@ from lcopa_bayes.sampling.lagdraws import LagMixture, LagSearch, likely
 
 _SUPPORT = 10.0
 """Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
+_HOPELESS = 50.0
+"""Difference beyond which no other kind is looked at: those in question differ by less [-]."""
 _RISEN = 0.3
 """Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
 _STREAM = 17
@@ -288,11 +290,15 @@ def _alternative(
     ends = np.array([_ends(plant, one) for one in paths])
     seed = plant.seed * 1_000 + 100 * paths[0].drive + 10 * _STREAM + axis
     drives = [one.drive for one in paths]
-    searches = likely(LagSearch.over(problem, axis, drives, noise, ends, kinds, open_to))
-    best = searches[0].best
-    parameters = best.parameters + len(_used(plant.posterior.table, beside))
-    advantage = square + 2 * plant.parameters((*paths, *beside)) - best.square - 2 * parameters
-    return Alternative(paths, searches, advantage, square, seed, beside)
+    level = square + 2 * plant.parameters((*paths, *beside)) - 2 * len(_used(plant.posterior.table, beside))
+
+    def advantage(search: LagSearch) -> float:
+        return level - search.best.square - 2 * search.best.parameters
+
+    searches = LagSearch.over(problem, axis, drives, noise, ends, kinds, open_to)
+    hopeless = advantage(searches[0]) < -_HOPELESS
+    searches = searches[:1] if hopeless else likely(searches)
+    return Alternative(paths, searches, advantage(searches[0]), square, seed, beside)
 
 
 def _slopes(plant: FittedPlant, problem: Problem, beside: Sequence[PathSlot]) -> tuple[Matrix, ...]:

@@ -101,14 +101,15 @@ class LagSearch:
         open_to: tuple[Matrix, ...] = (),
     ) -> tuple[LagSearch, ...]:
         """Searches over all delays between their ends (paths, 2) [time unit], and again where they are, of
-        every kind that may follow the records best."""
+        every kind that may follow the records best; that which does so far is first."""
         table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE), open_to)
         fits = {kind: lag_fits(diffused(table, kind)) for kind in kinds}
-        least = min(best_of(own).bic for own in fits.values())
+        ranked = sorted(kinds, key=lambda kind: best_of(fits[kind]).bic)
+        most = best_of(fits[ranked[0]]).bic + _NEAR
         return tuple(
-            cls(problem, axis, tuple(drives), noise, delays, _near(table, own, delays), kind, open_to)
-            for kind, own in fits.items()
-            if best_of(own).bic < least + _NEAR
+            cls(problem, axis, tuple(drives), noise, delays, _near(table, fits[kind], delays), kind, open_to)
+            for kind in ranked
+            if best_of(fits[kind]).bic < most or kind == ranked[0]
         )
 
     @cached_property
