@@ -100,7 +100,7 @@ def _width(fit: Fit, factor: float) -> Width:
 
 def _refit(target: Posterior, fit: Fit, undefined: Width) -> Width:
     """From walkers moved to the new posterior: all draws that the new priors allow take part; `undefined`
-    where those of an ensemble allow none."""
+    where those of an ensemble allow none, or where ensembles end too far apart."""
     coordinates = fit.run.kept()[0]
     shape = coordinates.shape
     allowed = np.isfinite(target.log_density(coordinates[:, :, -1].reshape(-1, shape[-1])))
@@ -109,7 +109,8 @@ def _refit(target: Posterior, fit: Fit, undefined: Width) -> Width:
     seed = fit.run.plan.seed + round(9_000 * undefined.factor)
     result = transferred(fit.near, target, coordinates[:, :, -1], seed, jump=True)
     again = result.evidence or evidence(target, result.coordinates, result.ess, seed)
-    assert again is not None
+    if again is None:
+        return undefined
     return replace(undefined, log_evidence=again.value, sd=again.sd, method="refit", ess=result.ess)
 
 

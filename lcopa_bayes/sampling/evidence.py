@@ -57,7 +57,7 @@ def known_to(error: float) -> Level:
 
 def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
     """Log evidence of a run: the mean weight of importance draws, with that of every batch; or `evidence` of
-    its ensembles, None for a single ensemble. `ess` as there."""
+    its ensembles. None and `ess` as there."""
     weighted = run.weighted
     if weighted is None:
         return evidence(posterior, run.kept()[0], ess, run.plan.seed)
@@ -68,6 +68,7 @@ def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
 def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:
     """Log evidence from draws (ensembles, walkers, draws, dimension); None for a single ensemble.
 
+    None too where the mixture of some ensembles meets no density: they have not reached what the others have.
     `ess` is the smallest effective sample size of all the draws. Deterministic given `seed`.
     """
     ensembles, dimension = coordinates.shape[0], coordinates.shape[-1]
@@ -82,13 +83,10 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
         mixture = Mixture.fitted(others, seed)
         drawn = mixture.draw(_BRIDGED, random)
         own = posterior.log_density(pool) + posterior.table.log_permutations - log_volume
-        estimates.append(
-            bridge(
-                own - mixture.log_density(y),
-                charted_density(posterior, chart, drawn) - mixture.log_density(drawn),
-                ess / ensembles,
-            )
-        )
+        other = charted_density(posterior, chart, drawn) - mixture.log_density(drawn)
+        if not (other > -np.inf).any():
+            return None
+        estimates.append(bridge(own - mixture.log_density(y), other, ess / ensembles))
     values = [value for value, _ in estimates]
     spread = float(np.std(values, ddof=1))
     claimed = float(np.sqrt(np.mean([error**2 for _, error in estimates])))
@@ -100,7 +98,7 @@ def bridge(posterior_side: Vector, mixture_side: Vector, ess: float) -> tuple[fl
 
     Both arguments are log (unnormalised density / normalised density of the mixture): at draws of the
     first, equivalent to `ess` independent draws, and at independent draws of the mixture; -inf is allowed
-    there.
+    there, not everywhere.
     """
     ess = min(ess, float(posterior_side.size))
     centre = float(np.median(posterior_side))

@@ -157,6 +157,19 @@ def test_a_single_ensemble_has_no_evidence():
     assert evidence(posterior, draws, 100.0, 1) is None
 
 
+def test_ensembles_far_apart_have_no_evidence():
+    """One of them where there is no density."""
+    toy = Toy(
+        lambda z: np.where(np.abs(z[:, 0]) > 1.9, 0.0, -np.inf),
+        {"a": ("uniform", {"loc": -2, "scale": 4}), "b": ("uniform", {"loc": 0, "scale": 1})},
+    )
+    rng = np.random.default_rng(0)
+    draws = rng.uniform((1.95, 0.45), (1.951, 0.55), (2, 10, 25, 2))
+    assert evidence(toy, draws, 250.0, 1) is not None
+    draws[1, ..., 0] = rng.uniform(-0.5, 0.5, (10, 25))
+    assert evidence(toy, draws, 250.0, 1) is None
+
+
 @pytest.mark.parametrize("alike", [True, False])
 def test_exchangeable_terms_are_counted_once(alike):
     """Against the mean likelihood of prior draws; noise so loud that these find the posterior, and the
