@@ -13,6 +13,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
+from lcopa_bayes.inference.recursions import Filter
 
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
@@ -103,6 +104,12 @@ class Whitening:
         pairs = zip(self.noise, np.sqrt(shares).tolist(), strict=True)
         return tuple(Law(root * law.sigma, root * law.sigma_ar, law.rho) for law, root in pairs)
 
+    @cached_property
+    def _filters(self) -> tuple[Filter, ...]:
+        """That of each part."""
+        laws = [law.parameters[None] for law in self.weighed]
+        return tuple(Filter.of(laws[part.axis], part.observed.gaps) for part in self.parts)
+
     @property
     def held(self) -> tuple[Vector, ...]:
         """The same as `WhiteAR1` takes it, (3,) each."""
@@ -111,9 +118,9 @@ class Whitening:
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)
-        for part in self.parts:
-            law = self.weighed[part.axis]
-            out[..., part.rows] = law.whiten(columns[..., part.rows], part.observed.gaps)
+        for part, whiten in zip(self.parts, self._filters, strict=True):
+            own = columns[..., part.rows]
+            out[..., part.rows] = whiten(own.reshape(1, -1, own.shape[-1])).reshape(own.shape)
         return out
 
     def adjoint(self, columns: Matrix) -> Matrix:

@@ -13,10 +13,11 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.effects import Effected, effect_slopes, effected_at
-from lcopa_bayes.inference.noise import GaussianNoise, White, WhiteAR1
+from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.recursions import Filter
 from lcopa_bayes.model.effects.effect import Effect, UnstableError
 
 _EDGE = 1e-6
@@ -227,11 +228,22 @@ class LeastSquares:
 
     def _whiten(self, columns: Matrix, values: Matrix, axis: int, gaps: Vector) -> Matrix:
         if self.held:
-            return np.asarray(WhiteAR1().whiten(columns[None], self.held[axis][None], gaps)[0][0])
+            return np.asarray(self._filter(axis, gaps)(columns[None])[0])
         noise = self.posterior.noise if isinstance(self.posterior.noise, GaussianNoise) else White()
         parameters = self.posterior.noise_parameters(values, axis)
         white: Matrix = noise.whiten(columns[None], parameters, gaps)[0][0]
         return white
+
+    def _filter(self, axis: int, gaps: Vector) -> Filter:
+        """That of the held noise of an axis at the samples of a record."""
+        key = axis, id(gaps)  # the posterior keeps them
+        if key not in self._filters:
+            self._filters[key] = Filter.of(self.held[axis][None], gaps)
+        return self._filters[key]
+
+    @cached_property
+    def _filters(self) -> dict[tuple[int, int], Filter]:
+        return {}
 
     def _prior_rows(self, raw: Vector) -> tuple[Matrix, Vector]:
         """Standardised normal priors as residual rows."""

@@ -13,7 +13,14 @@ from scipy.stats import t as student_t
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.recursions import correlated, differences, equal, factors, scalar_products
+from lcopa_bayes.inference.recursions import (
+    Filter,
+    correlated,
+    differences,
+    equal,
+    factors,
+    scalar_products,
+)
 
 if TYPE_CHECKING:
     from lcopa_bayes.inference.defaultpriors import Scales
@@ -198,10 +205,7 @@ class WhiteAR1(GaussianNoise):
     """White measurement noise plus a correlated part that is Gaussian and stationary.
 
     `sigma` is the standard deviation of the white part, `sigma_ar` that of the correlated part, whose
-    correlation over a gap of g sampling periods is ``rho**g``. Whitened by the prediction errors of the
-    scalar Kalman filter of the correlated part. ``w_t = y_t - rho**g_t y_{t-1}`` has a tridiagonal covariance
-    for any gaps, so that its LDL' factors are the filter: D holds the innovation variances, and the
-    forward substitution is the recursion of the innovations.
+    correlation over a gap of g sampling periods is ``rho**g``. Whitened by a Kalman filter (`recursions`).
     """
 
     kind = "white+ar1"
@@ -213,15 +217,8 @@ class WhiteAR1(GaussianNoise):
         batch, k, n = np.broadcast_shapes(columns.shape, (parameters.shape[0], 1, gaps.size))
         if n == 0:
             return np.empty((batch, k, 0)), np.zeros(parameters.shape[0])
-        link, variances, lower = factors(np.broadcast_to(parameters, (batch, 3)), gaps)
-        work = differences(columns, link, (k, batch, n))
-        # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
-        solved = dpttrs(variances, lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
-        out = solved.copy()
-        out[:, :-1] += lower * solved[:, 1:]
-        out *= np.sqrt(variances)
-        logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
-        return out.reshape(k, batch, n).swapaxes(0, 1), logs[: parameters.shape[0]]
+        filtered = Filter.of(np.broadcast_to(parameters, (batch, 3)), gaps)
+        return filtered(columns), filtered.log_scales.sum(axis=1)[: parameters.shape[0]]
 
     def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self, final
+
 import numpy as np
-from scipy.linalg.lapack import dpttrf
+from scipy.linalg.lapack import dpttrf, dpttrs
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
@@ -12,6 +16,53 @@ _HEAD, _STEADY = 64, 1e-15
 change from one sample to the next below which they have [-]."""
 _FEW = 8
 """Columns from which a product of matrices is faster than scalar products [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """Whitening of samples under laws of white noise with a correlated part, ready for any columns.
+
+    By the prediction errors of the scalar Kalman filter of the correlated part.
+    ``w_t = y_t - rho**g_t y_{t-1}`` has a tridiagonal covariance for any gaps g, so that its LDL' factors are
+    the filter: D holds the innovation variances, and the forward substitution is the recursion of the
+    innovations.
+    """
+
+    link: Matrix
+    """Correlation with the previous sample, (batch, n - 1), or (batch, 1) where all gaps are equal."""
+    variances: Vector
+    """Innovation variances of the whole batch in one row, (batch n,)."""
+    lower: Vector
+    """What the next sample takes of an innovation, (batch n - 1,)."""
+    samples: int
+
+    @classmethod
+    def of(cls, parameters: Matrix, gaps: Vector) -> Self:
+        """Of laws (batch, 3): standard deviations of both parts, and the correlation over a gap of 1, at
+        samples of which there is one or more; FloatingPointError where an innovation has no variance."""
+        return cls(*factors(parameters, gaps), gaps.size)
+
+    def __call__(self, columns: Array) -> Array:
+        """Whitened columns (batch, k, n)."""
+        batch, k, n = len(self.link), columns.shape[1], self.samples
+        work = differences(columns, self.link, (k, batch, n))
+        # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
+        solved = dpttrs(self.variances, self.lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
+        out = solved.copy()
+        out[:, :-1] += self.lower * solved[:, 1:]
+        out *= self.scales
+        return np.asarray(out.reshape(k, batch, n).swapaxes(0, 1))
+
+    @cached_property
+    def scales(self) -> Vector:
+        """Innovation standard deviations of the whole batch in one row, (batch n,)."""
+        return np.sqrt(self.variances)
+
+    @property
+    def log_scales(self) -> Matrix:
+        """Their logarithms, (batch, n)."""
+        return 0.5 * np.log(self.variances).reshape(-1, self.samples)
 
 
 def factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:
