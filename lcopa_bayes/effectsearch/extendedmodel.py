@@ -251,6 +251,6 @@ class ExtendedModel:
         values, new = self.values(x)[: len(self.plant.table.rows)], len(more.coefficients) - len(own)
         psi = np.concatenate([x[self.plant_size :][own], np.zeros(new)])
         scale = np.array([one.coefficient.scale for one in more.coefficients[-new:]])
-        slopes = [np.moveaxis(one, 2, 0) for one in more.signature(values, psi)]
+        slopes = [np.moveaxis(one, 2, 0) for one in more.signature(values, psi, last=True)]
         raw = stacked(self.plant.samples, slopes)[len(own) :].T
         return raw * scale, more.coefficients[-new:]

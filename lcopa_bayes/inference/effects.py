@@ -116,10 +116,11 @@ class Effected:
         """
         return self.simulator.responses(self.plant(values), psi)
 
-    def signature(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
-        """Derivative in psi (default: where it vanishes), per record (samples, axes, size of psi)."""
+    def signature(self, values: Vector, psi: Vector | None = None, *, last: bool = False) -> list[Matrix]:
+        """Derivative in psi (default: where it vanishes), per record (samples, axes, size of psi); in the
+        coefficients of the `last` effect only, if so."""
         at = self.vanishing if psi is None else psi
-        return coefficient_slopes(self.simulator, self.plant(values), at)
+        return coefficient_slopes(self.simulator, self.plant(values), at, last=last)
 
     def jacobian(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
         """Derivative in the table's values, per record (samples, axes, rows); 0 for noise parameters.

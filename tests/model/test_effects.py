@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -120,6 +120,22 @@ def test_vanishes(name: str):
     assert apart(made.responses(VALUES, made.vanishing), PLAIN) < 1e-12
     # and nearly vanishes by its own path through the simulator, which at 0 is not taken
     assert apart(made.responses(VALUES, 1e-9 * scales(made)), PLAIN) < 3e-9
+
+
+@pytest.mark.parametrize("first", ["refresh_hold", "sensor_lag", "rise_fall_asymmetry", "odd_curvature"])
+@pytest.mark.parametrize("name", ["grey_quantisation", "level_dependent_speed", "sensor_lag", "vibration"])
+def test_the_signature_of_a_further_effect_is_that_of_the_whole_simulated_anew(first: str, name: str):
+    """What the first does alone is simulated once, for all that is tried beside it."""
+    kept, tried = middle(first).effects[0], ALL[name].grid(BASE.ranges)[:2]
+    for effect in tried if name != first else ():
+        made = BASE.with_effects([kept, effect])
+        size = len(made.coefficients) - 1
+        psi = np.append(0.3 * scales(made)[:-size], np.zeros(size))
+        own = made.signature(VALUES, psi, last=True)
+        alone = replace(made, simulator=replace(made.simulator, still=simulator.Latest()))
+        for found, whole in zip(own, alone.signature(VALUES, psi), strict=True):
+            assert_allclose(found[..., -size:], whole[..., -size:], rtol=1e-9, atol=1e-7)
+            assert not found[..., :-size].any()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -417,6 +433,7 @@ class Unfinished(ReadoutEffect):
 
 class Taken(Doubled):
     card = Card("backflow", "output", "", "", "", "")
+
 """
 
 
@@ -431,7 +448,15 @@ def test_a_class_of_the_user(tmp_path):
 def test_bad_classes_are_reported_together(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("1 / 0")
-    add = ["own.py:Unfinished", "own.py:Taken", "own.py:Dubbled", "none.py:A", "broken.py:A", "own.py"]
+    add = [
+        "own.py:Unfinished",
+        "own.py:Taken",
+        "own.py:Dubbled",
+        "none.py:A",
+        "broken.py:A",
+        "own.py",
+        "own.py:Loose",
+    ]
     with pytest.raises(InputError) as reported:
         catalogue(add, tmp_path)
     text = "\n".join(reported.value.problems)

@@ -18,8 +18,11 @@ COEFFICIENT_STEP = 1e-3
 """Step of a coefficient, in prior standard deviations [-]."""
 
 
-def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[Matrix]:
-    """Derivative of the responses in psi, per record (samples, axes, coefficients) [response unit / unit].
+def coefficient_slopes(
+    simulator: Simulator, plant: Plant, psi: Vector, *, last: bool = False
+) -> list[Matrix]:
+    """Derivative of the responses in psi, per record (samples, axes, coefficients) [response unit / unit]; in
+    the coefficients of the `last` effect only, if so, and zero in the others.
 
     A difference through the simulator itself, of second order with `COEFFICIENT_STEP` prior standard
     deviations, to one side where a one-signed coefficient would turn negative; of first order, exact but
@@ -38,7 +41,8 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     for e, effect in enumerate(effects):
         coefficients = effect.coefficients(simulator.ranges)
         repeats = records if effect.card.per_record else 1
-        for k, coefficient in () if e in adding else enumerate(coefficients):
+        left_out = e in adding or (last and e < len(effects) - 1)
+        for k, coefficient in () if left_out else enumerate(coefficients):
             columns = first + k + len(coefficients) * np.arange(repeats)
             step = COEFFICIENT_STEP * coefficient.scale
             steps, weights = np.array([step]), np.array([-1.0, 1.0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar, final
@@ -37,11 +37,11 @@ _Value = TypeVar("_Value")
 
 
 @final
-class Latest(OrderedDict[bytes, _Value]):
+class Latest(OrderedDict[Hashable, _Value]):
     """The three values used last, so that what acts after the plant is evaluated without simulating it
     again."""
 
-    def get_or(self, key: bytes, made: Callable[[], _Value]) -> _Value:
+    def get_or(self, key: Hashable, made: Callable[[], _Value]) -> _Value:
         """The value of a key, made when it is not kept."""
         if key not in self:
             self[key] = made()
@@ -70,7 +70,8 @@ class Simulator:
     """Step responses of the latest plants; shared with simulators of other effects, for most
     simulations differ in the commands alone."""
     still: Latest[list[Moved]] = field(default_factory=Latest)
-    """The latest plants up to their reading where nothing acts before it; shared likewise."""
+    """The latest plants up to their reading where the last effect does not act before it; shared likewise:
+    what is tried in its place has them in common."""
 
     @cached_property
     def _kept(self) -> Latest[list[Moved]]:
@@ -130,11 +131,12 @@ class Simulator:
         Effects whose coefficients are all 0 are omitted, and what only changes commands is simulated by
         the forward model itself.
         """
-        parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
-        acts = any(part.any() for part in parts)
-        own = b"".join(part.tobytes() for part in parts) if acts else id(self.ranges).to_bytes(8)
-        key = plant.key + own  # what is kept holds its ranges, so that no others have their identity
-        return (self._kept if acts else self.still).get_or(key, lambda: self._simulated(plant, psi))
+        pairs = zip(self.effects, self._slices, self._acts(psi, UPSTREAM), strict=True)
+        acting = tuple((effect, psi[part].tobytes()) for effect, part, acts in pairs if acts)
+        whole = bool(acting) and acting[-1][0] is self.effects[-1]
+        # what is kept holds its ranges, so that no others have their identity
+        key = plant.key, id(self.ranges), acting
+        return (self._kept if whole else self.still).get_or(key, lambda: self._simulated(plant, psi))
 
     def _simulated(self, plant: Plant, psi: Vector) -> list[Moved]:
         acting = self._acts(psi, _BENDING)
@@ -191,7 +193,8 @@ class Simulator:
         size = max(1, _TOGETHER // longest)
         for acts, every in alike.items():
             kinds = [effect for effect, does in zip(self.effects, acts, strict=True) if does]
-            if not kinds or any(isinstance(effect, (DriveEffect, ForceEffect)) for effect in kinds):
+            alone = len(every) == 1 or any(isinstance(one, (DriveEffect, ForceEffect)) for one in kinds)
+            if alone or not kinds:
                 out |= {k: self.moved(*cases[k]) for k in every}
                 continue
             for begin in range(0, len(every), size):
