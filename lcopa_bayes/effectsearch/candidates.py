@@ -102,17 +102,22 @@ def _refitted(known: tuple[State, float, bool, float], task: tuple[Trace, Vector
     (state, least, far, reach), (seen, amplitude) = known, task
     (traced,) = seen.traced
     effect, reached_at = traced.signature.effect, None
+    base, quiet = (state.model, state.optimum, state.whitening), seen.scale.quiet
     try:
         if (far or traced.card.dynamics) and movable(traced):
             effect, reached_at = descended(state, seen, traced)
             amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
-        starts = [(effect, amplitude)]
+        # of what the plant imitates to first order a linear estimate says nothing
+        blind = traced.signature.survival < SEEN
+        promised = np.inf if blind else traced.signature.drop(seen.residual, seen.scale)
+        added = [(effect, amplitude)]
+        ends = [refit(*base, added, quiet, near=reached_at, least=reach, promised=promised)]
         settled = reached_at is not None or traced.card.dynamics
         other = None if settled else other_instance(seen, traced, least)
         if other is not None:
-            starts.append((other.effect, other.amplitude(seen.residual, seen.scale)))
-        base = (state.model, state.optimum, state.whitening)
-        ends = [refit(*base, [one], seen.scale.quiet, near=reached_at, least=reach) for one in starts]
+            added = [(other.effect, other.amplitude(seen.residual, seen.scale))]
+            promised = other.drop(seen.residual, seen.scale)
+            ends.append(refit(*base, added, quiet, least=reach, promised=promised))
     except ArithmeticError as error:
         return str(error)
     return min(ends, key=lambda end: end.optimum.cost)

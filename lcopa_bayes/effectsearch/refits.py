@@ -30,6 +30,10 @@ _PROCESSES = 400
 """Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
 """Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
+_KEPT = 0.9
+"""Share of what a linear estimate promises that shows a descent in the right place [-]."""
+_SLIGHT = 1.0
+"""Evidence that other constants of an effect would not mend [nat]."""
 _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
@@ -218,13 +222,16 @@ def refit(
     quiet: float,
     near: Vector | None = None,
     least: float = -np.inf,
+    promised: float = np.inf,
 ) -> Refit:
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
     noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then frees the
     effects' internal constants too (`freed`), and ends with the tangents of the whole. The evidence pays
-    for the choice among the instances that were tried. `near` are further coordinates to start from.
+    for the choice among the instances that were tried. `near` are coordinates to start from first. Where the
+    first start takes nearly as much off half the squared residual as a linear estimate has `promised`, there
+    is no other.
     ArithmeticError when no start has a bounded response, or what the first descent takes off the residual is
     worth less than `least` [nat].
     """
@@ -236,21 +243,19 @@ def refit(
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
         starts += [model.delayed(starts[0], share) for share in _DELAYS]
-    starts += [near] if near is not None else []
+    starts = [near, *starts] if near is not None else starts
     starts = [np.clip(start, low, high) for start in starts]  # starts only
     first = Regression(replace(extended, exact=False), whitening)
-    quick, _ = first.lowest(starts, gain=_NEAR)
-    if np.isfinite(least):
-        scale = Scale(quiet, whitening.effective - quick.size, np.array([2 * before.cost]))
-        worth = float(scale.gain(np.array([before.cost - first.cost(quick)]))[0])
-        if worth < least:
-            raise ArithmeticError(
-                f"a first descent is worth {worth:.3g} nat, where {least:.3g} or more count"
-            )
-    extended, start = freed(extended, quick, whitening, tuple(effect.name for effect, _ in added))
+    quick, _ = first.lowest(starts, gain=_NEAR, enough=before.cost - _KEPT * promised)
+    scale = Scale(quiet, whitening.effective - quick.size, np.array([2 * before.cost]))
+    worth = float(scale.gain(np.array([before.cost - first.cost(quick)]))[0])
+    if worth < least:
+        raise ArithmeticError(f"a first descent is worth {worth:.3g} nat, where {least:.3g} or more count")
+    names, start = tuple(effect.name for effect, _ in added), quick
+    if worth > _SLIGHT:
+        extended, start = freed(extended, quick, whitening, names)
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)
-    names = tuple(effect.name for effect, _ in added)
     extended, optimum, rare = with_room(extended, optimum, whitening, names)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-size:])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)

@@ -193,20 +193,27 @@ class Regression:
         )
 
     def lowest(
-        self, starts: Sequence[Vector], *, gain: float = GAIN, crew: Crew = ALONE
+        self, starts: Sequence[Vector], *, gain: float = GAIN, enough: float = -np.inf, crew: Crew = ALONE
     ) -> tuple[Vector, bool]:
         """`reached` from the best of several starts: a few evaluations from each, the best two taken to the
-        end.
+        end. Where a cost is `enough` [nat] the first is taken to the end before the others, and alone if it
+        reaches that.
 
         ArithmeticError when no start has a finite response.
         """
+        known = []
+        if enough > -np.inf:
+            alone = _glance(_EVALUATIONS, gain, self, starts[0])
+            if alone is not None and alone[0] <= enough:
+                return alone[1:]
+            known, starts = [alone], starts[1:]
         several, most = crew.sharing(self), _GLANCE if len(starts) > 1 else _EVALUATIONS
         glances = several.each(partial(_glance, most, gain), starts)
-        looked = [one for one in glances if one is not None]
+        looked = [one for one in [*known, *glances] if one is not None]
         if not looked:
             raise FloatingPointError("the simulated response is not finite at any start")
         looked.sort(key=lambda one: one[0])
-        ends = list(several.each(partial(_end, gain), [x for _, x in looked[:2]]))
+        ends = list(several.each(partial(_end, gain), [x for _, x, _ in looked[:2]]))
         return min(ends, key=lambda one: self.cost(one[0])) if len(ends) > 1 else ends[0]
 
     def best(self, starts: Sequence[Vector], crew: Crew = ALONE) -> Optimum:
@@ -215,14 +222,16 @@ class Regression:
         return self.at(x, converged=converged)
 
 
-def _glance(most: int, gain: float, regression: Regression, start: Vector) -> tuple[float, Vector] | None:
-    """Cost [nat] and coordinates after a few evaluations; None where the response at the start is not
-    finite."""
+def _glance(
+    most: int, gain: float, regression: Regression, start: Vector
+) -> tuple[float, Vector, bool] | None:
+    """Cost [nat] and coordinates after so many evaluations, and whether an optimum is reached; None where the
+    response at the start is not finite."""
     try:
-        x, _ = regression.reached(start, most=most, gain=gain)
+        x, converged = regression.reached(start, most=most, gain=gain)
     except ArithmeticError:
         return None
-    return regression.cost(x), x
+    return regression.cost(x), x, converged
 
 
 def _end(gain: float, regression: Regression, start: Vector) -> tuple[Vector, bool]:

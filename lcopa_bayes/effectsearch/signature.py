@@ -176,6 +176,11 @@ class Signature:
         scale = factor * self.scale
         return np.asarray(factor * self.turned.T @ (scale / (1 + scale**2) * (self.span.T @ residual)))
 
+    def drop(self, residual: Vector, scale_of: Scale) -> float:
+        """What these coefficients take off half the squared residual, if all is linear [-]."""
+        shift = self.scale * (self.turned @ self.amplitude(residual, scale_of))
+        return float(shift @ (self.span.T @ residual) - 0.5 * shift @ shift)
+
 
 def signature_of(
     model: ExtendedModel, x: Vector, whitening: Whitening, project: Projection, effect: Effect

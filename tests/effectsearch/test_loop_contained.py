@@ -95,6 +95,7 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
         return model, np.where(np.isfinite(away), away, x)
 
     monkeypatch.setattr(refits, "freed", spoilt)
+    monkeypatch.setattr(refits, "_SLIGHT", -np.inf)
     made = refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
     assert made.optimum.cost <= state.optimum.cost + 1e-9
     assert made.taken >= 0.0
@@ -105,6 +106,33 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
     assert stuck.optimum.cost > made.before.cost + 10.0
     again = stuck.under(state.whitening)
     assert again.optimum.cost <= again.before.cost + 1e-9
+
+
+def test_constants_are_moved_only_where_an_effect_is_worth_something(base, monkeypatch):
+    moved = []
+    monkeypatch.setattr(refits, "freed", lambda model, x, *_: (moved.append(model), (model, x))[1])
+    state, effect = base.start, PAIR[1]
+    refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
+    assert not moved  # the records have no pulse
+    monkeypatch.setattr(refits, "_SLIGHT", -np.inf)
+    refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
+    assert moved
+
+
+def test_other_starts_are_left_out_where_the_first_reaches_enough(base):
+    """Descents of one evaluation, from where the others end lower."""
+    x = base.start.optimum.x
+    regression = Regression(base.start.model, base.start.whitening)
+    low, high = regression.model.bounds
+    away = np.clip(x + 0.3 * base.start.model.spread, low, high)
+    first, best = regression.cost(away), base.start.optimum.cost
+    assert first > best + 10.0
+
+    def lowest(enough):
+        return regression.cost(regression.lowest([away, x, away], gain=1e12, enough=enough)[0])
+
+    assert lowest(first) > best + 1.0
+    assert lowest(best) == lowest(-np.inf) == pytest.approx(best, abs=0.01)
 
 
 APART = Device(

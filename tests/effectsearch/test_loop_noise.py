@@ -145,6 +145,17 @@ def test_amplitude_is_the_ridge_solution():
     np.testing.assert_allclose(found, direct, atol=1e-5)
 
 
+@pytest.mark.parametrize("size", [0.0, 20.0])
+def test_coefficients_take_off_the_residual_what_they_promise(size):
+    rng = np.random.default_rng(8)
+    columns = rng.normal(size=(30, 3))
+    residual = rng.normal(size=30) + size * columns[:, 1]
+    found, known = _signature(columns), _known(residual)
+    left = residual - columns @ found.amplitude(residual, known)
+    taken = 0.5 * (residual @ residual - left @ left)
+    assert found.drop(residual, known) == pytest.approx(taken, rel=1e-5)
+
+
 def test_an_effect_much_larger_than_its_prior_is_not_shrunk_to_it():
     rng = np.random.default_rng(7)
     columns = 0.05 * rng.normal(size=(400, 1))
