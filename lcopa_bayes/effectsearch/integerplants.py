@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from math import log
 from typing import final
 
-import numpy as np
-
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.lags import linear
+from lcopa_bayes.effectsearch.lesseffects import following, less_effects, with_effects
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.refits import without
@@ -26,6 +25,7 @@ from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED, Dynamics
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.integerorders import (
+    LEAST,
     Orders,
     most_likely,
     nearest,
@@ -35,6 +35,10 @@ from lcopa_bayes.inference.integerorders import (
     weight_of,
 )
 from lcopa_bayes.inference.parameter import Parameter
+
+_DOUBT = 50.0
+"""Log odds that effects may add to those of records less what they add beside free orders [nat]: their sizes
+change too."""
 
 
 @final
@@ -80,10 +84,19 @@ class IntegerPlant:
 
 def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
     """The plant of a final state with integer orders of all elements of one or two terms that the records let
-    have them; None without any."""
-    values = state.model.values(state.optimum.x)
-    orders = dict(nearest(state.model.plant.table, values))
-    return most_likely(orders, lambda own: _held(state, problem, own))
+    have them; None without any. With effects it is fitted to the records less these first."""
+    try:
+        bare = less_effects(state)
+    except ArithmeticError:
+        return None
+
+    def held(orders: Orders) -> IntegerPlant | None:
+        found = _held(bare, problem, orders)
+        if found is None or bare is state:
+            return found
+        return _with_effects(state, found) if found.log_odds > log(LEAST) - _DOUBT else None
+
+    return most_likely(dict(nearest(bare.model.plant.table, bare.model.values(bare.optimum.x))), held)
 
 
 def integer_dynamics(state: State, problem: Problem) -> Dynamics | None:
@@ -117,18 +130,29 @@ def _saved(state: State, size: int) -> float:
 
 
 def _held(state: State, problem: Problem, orders: Orders) -> IntegerPlant | None:
-    """The plant with these elements at integer orders; None where it cannot follow the records."""
+    """The plant of a state without effects with these elements at integer orders; None where it cannot follow
+    the records."""
     table = state.model.plant.table
     try:
         own = problem_with(problem, table, orders)
-        model = ExtendedModel(own.posterior)
+        model = following(ExtendedModel(own.posterior), state.whitening.samples)
         values = state.model.values(state.optimum.x)
         begun = [model.coordinates(one) for one in starts(table, values, model.plant.table, orders)]
-        model = model.at_scales(begun[0], campaign_places(own.study)).having(*state.model.effects)
-        model = replace(model, wider=state.model.wider)
-        effects = state.optimum.x[state.model.plant_size :]
-        optimum = Regression(model, state.whitening).best([np.concatenate([x, effects]) for x in begun])
+        optimum = Regression(model, state.whitening).best(begun)
+        model = model.at_scales(optimum.x, campaign_places(own.study))
     except (ArithmeticError, InputError):
         return None
     plant = OtherPlant.beside(state, model, optimum)
     return IntegerPlant(plant, orders, plant.gained + _saved(state, optimum.x.size), own)
+
+
+def _with_effects(state: State, found: IntegerPlant) -> IntegerPlant | None:
+    """A plant that follows the records less the effects of a state, with these; None without a bounded
+    response."""
+    bare = found.plant.state
+    try:
+        model, optimum = with_effects(state, bare.model, bare.optimum.x)
+    except ArithmeticError:
+        return None
+    plant = OtherPlant.beside(state, model, optimum)
+    return replace(found, plant=plant, log_odds=plant.gained + _saved(state, optimum.x.size))

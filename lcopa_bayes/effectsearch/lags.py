@@ -15,15 +15,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.wording import listed
+from lcopa_bayes.effectsearch.lesseffects import added, samples_less
 from lcopa_bayes.effectsearch.openeffects import Weighed
-from lcopa_bayes.effectsearch.refits import places, without
+from lcopa_bayes.effectsearch.refits import places
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.verdict import REACHED, Dynamics
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.layout import Layout, PathSlot
@@ -52,7 +51,7 @@ def fitted_plant(state: State, problem: Problem) -> FittedPlant:
     model = state.model
     constant = [effect.name for effect in model.effects if linear(effect)]
     others = [effect.name for effect in model.effects if not linear(effect)]
-    plant = replace(model.plant, samples=_without(state, [*constant, *others]), noise=WhiteAR1())
+    plant = replace(model.plant, samples=samples_less(state, [*constant, *others]), noise=WhiteAR1())
     values = model.values(state.optimum.x)[: len(plant.table.rows)]
     more, acting = sum(len(places(model, name)) for name in constant), _acting(state, constant)
     return FittedPlant(
@@ -62,7 +61,7 @@ def fitted_plant(state: State, problem: Problem) -> FittedPlant:
         curves_of(plant.table, values[None], problem.scales.span),
         problem.study.seed,
         tuple(more * (axis in acting) for axis in range(len(state.whitening.noise))),
-        _without(state, others),
+        samples_less(state, others),
     )
 
 
@@ -112,24 +111,8 @@ def linear(effect: Effect) -> bool:
 
 def _acting(state: State, names: Sequence[str]) -> set[int]:
     """Response axes on which effects act."""
-    added = _added(state, names)
-    return {part.axis for part in state.whitening.parts if added[part.rows].any()}
-
-
-def _added(state: State, names: Sequence[str]) -> Vector:
-    """What effects add at the optimum, stacked [response unit]."""
-    bare, own = without(state.model, state.optimum.x, names)
-    return state.fitted - bare.predict(own) if names else np.zeros(state.whitening.size)
-
-
-def _without(state: State, names: Sequence[str]) -> tuple[Samples, ...]:
-    """Samples less what effects add at the optimum."""
-    added, out = _added(state, names), [list(samples.axes) for samples in state.whitening.samples]
-    for part in state.whitening.parts:
-        observed = part.observed
-        out[part.record][part.axis] = replace(observed, values=observed.values - added[part.rows])
-    pairs = zip(state.whitening.samples, out, strict=True)
-    return tuple(replace(samples, axes=tuple(axes)) for samples, axes in pairs)
+    shown = added(state, names)
+    return {part.axis for part in state.whitening.parts if shown[part.rows].any()}
 
 
 def figures_with_lags(

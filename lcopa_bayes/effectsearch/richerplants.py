@@ -9,13 +9,12 @@ in none of the verdict.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import final
-
-import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.lesseffects import following, less_effects, with_effects
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.regression import Regression
@@ -43,17 +42,22 @@ class RicherPlants:
     def beside(cls, state: State, wider: Sequence[State]) -> RicherPlants:
         """Those of a base fit's `wider` states that follow the records with the effects of a final model, by
         terms of which none is a gain."""
+        try:
+            bare = less_effects(state)
+        except ArithmeticError:
+            return cls()
         out = []
         for one in wider:
-            model = replace(one.model.having(*state.model.effects), wider=state.model.wider)
-            x = np.concatenate([one.optimum.x, state.optimum.x[state.model.plant_size :]])
+            plant = following(one.model.having(), bare.whitening.samples)
             try:
-                optimum = Regression(model, state.whitening).descend(x)
+                x, _ = Regression(plant, bare.whitening).reached(one.optimum.x)
+                if _least_order(plant, x) < _STATIC:
+                    continue
+                model, optimum = with_effects(state, one.model, x)
             except ArithmeticError:
                 continue
-            if _least_order(model, optimum.x) < _STATIC:
-                continue
-            out.append(OtherPlant.beside(state, model, optimum))
+            if _least_order(model, optimum.x) >= _STATIC:
+                out.append(OtherPlant.beside(state, model, optimum))
         return cls(tuple(out))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:

@@ -17,6 +17,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_dynamics, integer_plant
 from lcopa_bayes.effectsearch.lags import lags_of
+from lcopa_bayes.effectsearch.lesseffects import less_effects
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
@@ -200,6 +201,41 @@ def with_effect(base: Base, effect: Effect, psi: float) -> State:
     model = start.model.having(effect)
     x = np.append(start.optimum.x, psi)
     return State(model, Regression(model, start.whitening).descend(x), start.whitening)
+
+
+def test_beside_an_effect_it_is_that_of_a_descent_of_the_whole() -> None:
+    """Though it is found on the records less the effect: by descents with stated orders and the effect, from
+    the plant without it."""
+    plain = based((RINGING,), 2).problem.study
+    bent = tuple(replace(one, response=one.response + 0.2 * one.response**2) for one in plain.fit)
+    base = fitted_base(replace(plain, fit=bent), (), as_stated=True, draws=100)
+    state = with_effect(base, EvenCurvature(), 0.05)
+    assert state.optimum.cost < base.start.optimum.cost - 50.0
+    integer = integer_plant(state, base.problem)
+    assert integer is not None
+    assert integer.orders == {"": (2.0, 1.0)}
+    stated = replace(plain, fit=bent, model=replace(plain.model, terms=2, orders=(2.0, 1.0)))
+    other = fitted_base(stated, (), as_stated=True, draws=100)
+    model = integer.plant.state.model
+    assert other.start.model.names == model.names[:-1]
+    starts = [np.append(other.start.optimum.x, psi) for psi in (0.0, 0.05)]
+    optimum = Regression(model, state.whitening).best(starts)
+    gained = 0.5 * (state.optimum.white @ state.optimum.white - optimum.white @ optimum.white)
+    assert integer.plant.gained == pytest.approx(gained, abs=0.05)
+    assert integer.log_odds == pytest.approx(gained + log(state.whitening.effective), abs=0.05)
+
+
+def test_records_less_the_effects_are_those_of_the_plant_alone() -> None:
+    base = based((RINGING,), 2)
+    state = with_effect(base, EvenCurvature(), 0.05)
+    held = replace(
+        state, optimum=Regression(state.model, state.whitening).at(np.append(state.optimum.x[:-1], 0.3))
+    )
+    bare = less_effects(held)
+    assert not bare.model.effects
+    same = Regression(bare.model, bare.whitening).at(held.optimum.x[:-1])
+    np.testing.assert_allclose(same.residual, held.optimum.residual, atol=1e-12)
+    assert less_effects(base.start) is base.start
 
 
 def test_a_lag_that_imitates_a_second_order_takes_no_name() -> None:
