@@ -252,7 +252,7 @@ def refit(
     if worth < least:
         raise ArithmeticError(f"a first descent is worth {worth:.3g} nat, where {least:.3g} or more count")
     names, start = tuple(effect.name for effect, _ in added), quick
-    if worth > _SLIGHT:
+    if worth > _SLIGHT or whitening.dependence:  # noise known from residuals alone holds the effect too
         extended, start = freed(extended, quick, whitening, names)
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)
