@@ -108,14 +108,17 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
     assert again.optimum.cost <= again.before.cost + 1e-9
 
 
-def test_constants_are_moved_only_where_an_effect_is_worth_something(base, monkeypatch):
+@pytest.mark.parametrize("known", [True, False])
+def test_constants_are_moved_only_where_an_effect_is_worth_something(base, monkeypatch, known):
+    """Under noise that is known: noise of the residual alone holds the effect too."""
     moved = []
     monkeypatch.setattr(refits, "freed", lambda model, x, *_: (moved.append(model), (model, x))[1])
     state, effect = base.start, PAIR[1]
-    refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
-    assert not moved  # the records have no pulse
+    whitening = replace(state.whitening, dependence=() if known else (2.0,))
+    refit(state.model, state.optimum, whitening, [(effect, np.ones(1))], 50.0)
+    assert bool(moved) is not known  # the records have no pulse
     monkeypatch.setattr(refits, "_SLIGHT", -np.inf)
-    refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
+    refit(state.model, state.optimum, whitening, [(effect, np.ones(1))], 50.0)
     assert moved
 
 
