@@ -38,7 +38,7 @@ HEADS = {
 """Columns of each verb."""
 ERRORS = (
     "Held-out errors are root mean squares, of the fit in the unit of the record, of the loop over the",
-    "noise of the fit, before and after.",
+    "noise that it ends with, before and after.",
     "",
 )
 QUICK, BUDGET = ("silverbox", "cd_player_arm"), 300.0
@@ -143,9 +143,10 @@ def _of_fit(row: dict[str, Any]) -> list[str]:
 
 
 def _of_loop(row: dict[str, Any]) -> list[str]:
+    was, now = row["held_out_rmse"]
     pairs = [
-        f"{name} {before:.2f} to {row['after']['held_out'][name]:.2f}"
-        for name, before in row["before"]["held_out"].items()
+        f"{name} {ratio * was[name] / now[name]:.2f} to {ratio:.2f}"
+        for name, ratio in row["after"]["held_out"].items()
     ]
     said = f"{row['verdict']} ({row['confidence']})"
     return [said, *(", ".join(one) or "-" for one in (row["effects"], pairs))]

@@ -138,7 +138,7 @@ def test_a_wall_is_drawn_where_it_follows_the_records_best() -> None:
 
 
 def test_the_response_of_a_wall_is_that_of_its_series_and_lags() -> None:
-    search = slab(0)[1]
+    (search,) = [one for one in slab(0) if one.kind == "wall"]
     one = lag_draws(search, search.lags[-1], 0)
     assert one.kind == "wall"
     time = np.array([0.1, 0.5, 1.0, 10.0, 1e4])
