@@ -214,9 +214,7 @@ class WhiteAR1(GaussianNoise):
 
     def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
-        batch, k, n = np.broadcast_shapes(columns.shape, (parameters.shape[0], 1, gaps.size))
-        if n == 0:
-            return np.empty((batch, k, 0)), np.zeros(parameters.shape[0])
+        batch = max(len(columns), len(parameters))
         filtered = Filter.of(np.broadcast_to(parameters, (batch, 3)), gaps)
         return filtered(columns), filtered.log_scales.sum(axis=1)[: parameters.shape[0]]
 

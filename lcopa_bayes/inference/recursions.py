@@ -39,13 +39,17 @@ class Filter:
 
     @classmethod
     def of(cls, parameters: Matrix, gaps: Vector) -> Self:
-        """Of laws (batch, 3): standard deviations of both parts, and the correlation over a gap of 1, at
-        samples of which there is one or more; FloatingPointError where an innovation has no variance."""
+        """Of laws (batch, 3): standard deviations of both parts, and the correlation over a gap of 1, at any
+        number of samples; FloatingPointError where an innovation has no variance."""
+        if not gaps.size:  # LAPACK's wrappers want one
+            return cls(np.empty((len(parameters), 0)), np.empty(0), np.empty(0), 0)
         return cls(*factors(parameters, gaps), gaps.size)
 
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (batch, k, n)."""
         batch, k, n = len(self.link), columns.shape[1], self.samples
+        if not n:
+            return np.empty((batch, k, 0))
         work = differences(columns, self.link, (k, batch, n))
         # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
         solved = dpttrs(self.variances, self.lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
@@ -62,7 +66,7 @@ class Filter:
     @property
     def log_scales(self) -> Matrix:
         """Their logarithms, (batch, n)."""
-        return 0.5 * np.log(self.variances).reshape(-1, self.samples)
+        return 0.5 * np.log(self.variances).reshape(len(self.link), self.samples)
 
 
 def factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:

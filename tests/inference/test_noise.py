@@ -17,7 +17,7 @@ from lcopa_bayes.data.settings import NoiseKind
 from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
 from lcopa_bayes.inference.observations import Samples, sampling_period
-from lcopa_bayes.inference.recursions import equal
+from lcopa_bayes.inference.recursions import Filter, equal
 
 gaps_lists = st.lists(st.floats(0.05, 20.0), min_size=1, max_size=12).map(np.array)
 sigmas = st.floats(1e-6, 1e3)
@@ -265,3 +265,13 @@ def test_every_noise_is_known_by_its_kind():
         parameters = np.full((3, len(noise.names)), 0.5)
         for n in (0, 1, 4):
             assert noise().pointwise(np.ones((3, n)), parameters, np.ones(n)).shape == (3, n)
+
+
+def test_an_axis_without_samples_has_nothing_to_whiten():
+    """Of any number of laws: records need not have samples of every axis."""
+    laws = np.array([[0.3, 0.2, 0.6], [0.1, 0.4, 0.9]])
+    filtered = Filter.of(laws, np.empty(0))
+    assert filtered(np.empty((2, 3, 0))).shape == (2, 3, 0)
+    white, scales = WhiteAR1().whiten(np.empty((1, 3, 0)), laws, np.empty(0))
+    assert white.shape == (2, 3, 0)
+    assert scales.tolist() == [0.0, 0.0]
