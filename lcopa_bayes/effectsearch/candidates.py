@@ -89,8 +89,8 @@ def refitted(
     dynamics = {name: task for name, task in tasks.items() if seen.of(name).card.dynamics}
     names = {name: task for name, task in tasks.items() if name not in dynamics}
     ends = dict(zip(names, known.each(_refitted, list(names.values())), strict=True))
-    done = [end for end in ends.values() if isinstance(end, Refit)]
-    if rival == -np.inf or state.whitening.dependence or any(one.log_bayes_factor >= rival for one in done):
+    evidences = [end.log_bayes_factor for end in ends.values() if isinstance(end, Refit)]
+    if rival == -np.inf or state.whitening.dependence or any(one >= rival for one in evidences):
         ends |= zip(dynamics, known.each(_refitted, list(dynamics.values())), strict=True)
     done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
     failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
@@ -110,14 +110,16 @@ def _refitted(known: tuple[State, float, bool, float], task: tuple[Trace, Vector
         # of what the plant imitates to first order a linear estimate says nothing
         blind = traced.signature.survival < SEEN
         promised = np.inf if blind else traced.signature.drop(seen.residual, seen.scale)
-        added = [(effect, amplitude)]
-        ends = [refit(*base, added, quiet, near=reached_at, least=reach, promised=promised)]
+        starts = [(effect, amplitude, promised)]
         settled = reached_at is not None or traced.card.dynamics
         other = None if settled else other_instance(seen, traced, least)
         if other is not None:
-            added = [(other.effect, other.amplitude(seen.residual, seen.scale))]
-            promised = other.drop(seen.residual, seen.scale)
-            ends.append(refit(*base, added, quiet, least=reach, promised=promised))
+            against = (seen.residual, seen.scale)
+            starts.append((other.effect, other.amplitude(*against), other.drop(*against)))
+        ends = [
+            refit(*base, [(one, size)], quiet, near=reached_at, least=reach, promised=worth)
+            for one, size, worth in starts
+        ]
     except ArithmeticError as error:
         return str(error)
     return min(ends, key=lambda end: end.optimum.cost)

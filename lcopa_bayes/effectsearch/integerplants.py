@@ -15,7 +15,7 @@ from typing import final
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.lags import linear
-from lcopa_bayes.effectsearch.lesseffects import following, less_effects, with_effects
+from lcopa_bayes.effectsearch.lesseffects import descended_with_effects, following, less_effects
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.refits import without
@@ -151,7 +151,7 @@ def _with_effects(state: State, found: IntegerPlant) -> IntegerPlant | None:
     response."""
     bare = found.plant.state
     try:
-        model, optimum = with_effects(state, bare.model, bare.optimum.x)
+        model, optimum = descended_with_effects(state, bare.model, bare.optimum.x)
     except ArithmeticError:
         return None
     plant = OtherPlant.beside(state, model, optimum)

@@ -51,7 +51,7 @@ def following(model: ExtendedModel, samples: Sequence[Samples]) -> ExtendedModel
     return replace(model, plant=replace(model.plant, samples=tuple(samples)))
 
 
-def with_effects(state: State, plant: ExtendedModel, x: Vector) -> tuple[ExtendedModel, Optimum]:
+def descended_with_effects(state: State, plant: ExtendedModel, x: Vector) -> tuple[ExtendedModel, Optimum]:
     """Another plant at scales of its own, with the effects of a state on its records, and its optimum, from
     the coordinates `x` of the plant alone and the state's coefficients.
 

@@ -14,7 +14,7 @@ from typing import final
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.lesseffects import following, less_effects, with_effects
+from lcopa_bayes.effectsearch.lesseffects import descended_with_effects, following, less_effects
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.regression import Regression
@@ -53,7 +53,7 @@ class RicherPlants:
                 x, _ = Regression(plant, bare.whitening).reached(one.optimum.x)
                 if _least_order(plant, x) < _STATIC:
                     continue
-                model, optimum = with_effects(state, one.model, x)
+                model, optimum = descended_with_effects(state, one.model, x)
             except ArithmeticError:
                 continue
             if _least_order(model, optimum.x) >= _STATIC:

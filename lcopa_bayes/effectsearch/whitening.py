@@ -107,8 +107,8 @@ class Whitening:
     @cached_property
     def _filters(self) -> tuple[Filter, ...]:
         """That of each part."""
-        laws = [law.parameters[None] for law in self.weighed]
-        return tuple(Filter.of(laws[part.axis], part.observed.gaps) for part in self.parts)
+        held = self.held
+        return tuple(Filter.of(held[part.axis][None], part.observed.gaps) for part in self.parts)
 
     @property
     def held(self) -> tuple[Vector, ...]:

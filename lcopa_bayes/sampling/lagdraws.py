@@ -104,12 +104,11 @@ class LagSearch:
         every kind that may follow the records best; that which does so far is first."""
         table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE), open_to)
         fits = {kind: lag_fits(diffused(table, kind)) for kind in kinds}
-        ranked = sorted(kinds, key=lambda kind: best_of(fits[kind]).bic)
-        most = best_of(fits[ranked[0]]).bic + _NEAR
+        level = {kind: best_of(own).bic for kind, own in fits.items()}
         return tuple(
             cls(problem, axis, tuple(drives), noise, delays, _near(table, fits[kind], delays), kind, open_to)
-            for kind in ranked
-            if best_of(fits[kind]).bic < most or kind == ranked[0]
+            for kind in sorted(level, key=lambda kind: level[kind])
+            if level[kind] < min(level.values()) + _NEAR
         )
 
     @cached_property

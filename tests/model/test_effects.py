@@ -433,7 +433,6 @@ class Unfinished(ReadoutEffect):
 
 class Taken(Doubled):
     card = Card("backflow", "output", "", "", "", "")
-
 """
 
 
@@ -448,15 +447,7 @@ def test_a_class_of_the_user(tmp_path):
 def test_bad_classes_are_reported_together(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("1 / 0")
-    add = [
-        "own.py:Unfinished",
-        "own.py:Taken",
-        "own.py:Dubbled",
-        "none.py:A",
-        "broken.py:A",
-        "own.py",
-        "own.py:Loose",
-    ]
+    add = ["own.py:Unfinished", "own.py:Taken", "own.py:Dubbled", "none.py:A", "broken.py:A", "own.py"]
     with pytest.raises(InputError) as reported:
         catalogue(add, tmp_path)
     text = "\n".join(reported.value.problems)
