@@ -96,12 +96,12 @@ def _at_noise(one: Alternative, quiet: int) -> bool:
     """Whether sums of lags, or the plant, leave no more than noise known from so many samples."""
     best = one.search.best
     chance = f_distribution.ppf(_CHANCE, best.size, quiet) if quiet else np.inf
-    return bool(min(one.square, best.square) / best.size <= max(REACHED**2, chance))
+    return bool(min(one.square, best.misfit) / best.size <= max(REACHED**2, chance))
 
 
 def _behind(one: Alternative) -> float:
     """What sums of lags lack in log likelihood of the plant and its effects [nat]."""
-    return 0.5 * (one.search.best.square - one.square)
+    return 0.5 * (one.search.best.misfit - one.square)
 
 
 def linear(effect: Effect) -> bool:

@@ -42,6 +42,8 @@ class LagFit:
     """Of the coordinates, (dimension, dimension)."""
     square: float
     """Whitened residual and weights, squared [-]."""
+    weights: float
+    """Of that, the weights, in standard deviations of their prior."""
     size: int
 
     @property
@@ -49,6 +51,17 @@ class LagFit:
         """Time constants, weights and delays [-]."""
         paths = self.coordinates.size // (self.lags + 1)
         return paths * (2 * self.lags + 1)
+
+    @property
+    def misfit(self) -> float:
+        """Whitened residual, squared [-]."""
+        return self.square - self.weights
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, up to what all models of one record have in common [-]: weights of lags that
+        are hardly apart are large and of either sign, and their prior says nothing against such a plant."""
+        return self.misfit + 2 * self.parameters
 
     @property
     def bic(self) -> float:
@@ -120,8 +133,9 @@ def _best_from(table: LagTable, lags: int, starts: Matrix) -> LagFit:
     every = LagDescents(table, np.arange(starts.shape[1]))
     ends = descended(every, np.clip(starts, *table.ends(lags)), steps=_DESCENT, least=_GAIN)
     best = int(ends.level.argmax())
-    square = table.remainder - 2 * float(ends.level[best])
-    return LagFit(lags, ends.points[best], ends.information[best], square, table.size)
+    point, square = ends.points[best], table.remainder - 2 * float(ends.level[best])
+    weights = table.residuals(point[None])[0, table.target.size :]
+    return LagFit(lags, point, ends.information[best], square, float(weights @ weights), table.size)
 
 
 def _exchanged(table: LagTable, coordinates: Vector) -> Vector:

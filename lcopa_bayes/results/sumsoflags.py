@@ -20,6 +20,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.diffusion import KINDS, Kind
+from lcopa_bayes.inference.lagsearch import LagSearch, likely
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -28,7 +29,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
-from lcopa_bayes.sampling.lagdraws import LagMixture, LagSearch, likely
+from lcopa_bayes.sampling.lagdraws import LagMixture
 
 _SUPPORT = 10.0
 """Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
@@ -293,7 +294,7 @@ def _alternative(
     level = square + 2 * plant.parameters((*paths, *beside)) - 2 * len(_used(plant.posterior.table, beside))
 
     def advantage(search: LagSearch) -> float:
-        return level - search.best.square - 2 * search.best.parameters
+        return level - search.aic
 
     searches = LagSearch.over(problem, axis, drives, noise, ends, kinds, open_to)
     hopeless = advantage(searches[0]) < -_HOPELESS

@@ -2,9 +2,7 @@
 
 The number of lags is the best by BIC in half of the draws, and in the others one more, which the records need
 not show: what it leaves open of a number is part of that number's interval. Draws with a spare lag alone
-would not do: most of its prior is at later delays, and an interval over them begins after the true one. A
-diffusion may stand in place of the first lag of each path, where it follows the records as well
-(`inference.diffusion`). Delays are tabulated over all that is asked first and then where they are.
+would not do: most of its prior is at later delays, and an interval over them begins after the true one.
 
 One path has so few coordinates that importance sampling from a mixture holds, which is fitted to the draws of
 all its forerunners; these are fitted to powers of the density that rise to 1, so that ridges are followed to
@@ -26,24 +24,16 @@ from scipy.stats.qmc import Halton
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
-from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.descents import descended
-from lcopa_bayes.inference.diffusion import KINDS, Kind, diffused, rises
-from lcopa_bayes.inference.lagfits import MOST, LagDescents, LagFit, best_of, lag_fits
-from lcopa_bayes.inference.lagsum import LagTable, lag_table
+from lcopa_bayes.inference.diffusion import Kind, rises
+from lcopa_bayes.inference.lagfits import LagDescents
+from lcopa_bayes.inference.lagsearch import FINE, LagSearch
+from lcopa_bayes.inference.lagsum import LagTable
 from lcopa_bayes.sampling.importanceweights import usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.proposal import Seen, adapted
 from lcopa_bayes.sampling.weighted import resampled, tail_smoothed
 
-_COARSE, _FINE = 17, 33
-"""Delays tabulated over all that is asked, and where they are."""
-_NEAR = 20.0
-"""BIC above the least of a number of lags, or of a kind, which is still looked at [-]."""
-_LIKELY = 10.0
-"""BIC above the least of a kind up to which it has an equal part in the draws [-]."""
-_REACH = 10.0
-"""Standard deviations of a delay that are tabulated on either side [-]."""
 _POWERS = (0.05, 0.1, 0.3, 1.0, 1.0)
 """Of the density, to which each mixture but the first is fitted [-]; the last where the one before is not
 enough."""
@@ -68,76 +58,6 @@ _KEPT = 1_000
 """Most draws that are kept."""
 _AT_END = 0.01
 """Share of the draws beside an end of the tabulated delays that moves the end."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class LagSearch:
-    """Least squares of sums of lags for some drives of a `lag_problem` on one response axis."""
-
-    problem: Problem
-    axis: int
-    drives: tuple[int, ...]
-    noise: Vector
-    """Its parameters, (names,)."""
-    delays: Matrix
-    """Ends between which delays are uniform, (paths, 2) [time unit]."""
-    near: Matrix
-    """Those between which they are tabulated, (paths, 2) [time unit]."""
-    kind: Kind = "lags"
-    """What the first component of a path is."""
-    open_to: tuple[Matrix, ...] = ()
-    """Directions along which the samples of each record may lie anywhere, (directions, samples), or none."""
-
-    @classmethod
-    def over(
-        cls,
-        problem: Problem,
-        axis: int,
-        drives: Sequence[int],
-        noise: Vector,
-        delays: Matrix,
-        kinds: Sequence[Kind] = KINDS,
-        open_to: tuple[Matrix, ...] = (),
-    ) -> tuple[LagSearch, ...]:
-        """Searches over all delays between their ends (paths, 2) [time unit], and again where they are, of
-        every kind that may follow the records best; that which does so far is first."""
-        table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE), open_to)
-        fits = {kind: lag_fits(diffused(table, kind)) for kind in kinds}
-        level = {kind: best_of(own).bic for kind, own in fits.items()}
-        return tuple(
-            cls(problem, axis, tuple(drives), noise, delays, _near(table, fits[kind], delays), kind, open_to)
-            for kind in sorted(level, key=lambda kind: level[kind])
-            if level[kind] < min(level.values()) + _NEAR
-        )
-
-    @cached_property
-    def table(self) -> LagTable:
-        """Responses of the delays that are tabulated."""
-        nodes = _nodes(self.near, _FINE)
-        lags = lag_table(self.problem, self.axis, self.drives, self.noise, nodes, self.open_to)
-        return diffused(lags, self.kind)
-
-    @cached_property
-    def fits(self) -> tuple[LagFit, ...]:
-        """The best with each number of lags."""
-        return lag_fits(self.table)
-
-    @property
-    def best(self) -> LagFit:
-        """With the number of lags that is best by BIC."""
-        return best_of(self.fits)
-
-    @property
-    def lags(self) -> tuple[int, ...]:
-        """Numbers of lags of the draws: that of the best and one more, where there may be so many."""
-        best = self.best.lags
-        return (best, best + 1) if best < MOST else (best,)
-
-    @property
-    def apart(self) -> int:
-        """Components of a path that are no lags as all others [-]."""
-        return int(self.kind != "lags")
 
 
 @final
@@ -211,12 +131,6 @@ class LagMixture:
         return np.asarray(np.concatenate([one.response(path, time) for one in self.parts])[self.picked])
 
 
-def likely(searches: Sequence[LagSearch]) -> tuple[LagSearch, ...]:
-    """Those that follow the records about as well as the best by BIC, which is first."""
-    ranked = sorted(searches, key=lambda one: one.best.bic)
-    return tuple(one for one in ranked if one.best.bic < ranked[0].best.bic + _LIKELY)
-
-
 def lag_draws(search: LagSearch, lags: int, seed: int, wanted: float = _WANTED) -> LagDraws:
     """Draws of so many lags about the optima of a search, effectively as many as are `wanted`, tabulated
     farther out where they stand beside an end."""
@@ -234,23 +148,11 @@ def lag_draws(search: LagSearch, lags: int, seed: int, wanted: float = _WANTED) 
     return LagDraws(search.kind, np.exp(log_times), weights, own, ess)
 
 
-def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
-    """Ends between which delays are, (paths, 2): those of every likely number of lags and around."""
-    best = best_of(fits)
-    likely = [one for one in fits if one.bic < best.bic + _NEAR]
-    places = np.array([one.coordinates[-table.paths :] for one in likely])
-    reach = (
-        _REACH * np.sqrt(np.diag(best.covariance)[-table.paths :]) + table.delays[:, 1] - table.delays[:, 0]
-    )
-    low = np.maximum(places.min(axis=0) - reach, delays[:, 0])
-    return np.stack([low, np.minimum(places.max(axis=0) + reach, delays[:, 1])], axis=1)
-
-
 def _wider(search: LagSearch, draws: Matrix) -> Matrix:
     """The ends of the tabulated delays, farther out where draws stand beside them."""
     near, delays, paths = search.near, search.delays, len(search.drives)
     own, width = draws[:, -paths:], near[:, 1] - near[:, 0]
-    edge = width / (_FINE - 1)
+    edge = width / (FINE - 1)
     below = (own < near[:, 0] + edge).mean(axis=0) > _AT_END
     above = (own > near[:, 1] - edge).mean(axis=0) > _AT_END
     low = np.where(below, np.maximum(near[:, 0] - width, delays[:, 0]), near[:, 0])
@@ -390,8 +292,3 @@ def _narrowed(covariance: Matrix, widest: Vector) -> Matrix:
     sd = np.sqrt(np.diag(covariance))
     shrunk = np.minimum(1.0, widest / np.maximum(sd, 1e-300))
     return np.asarray(covariance * np.outer(shrunk, shrunk) + np.diag((1e-2 * widest) ** 2))
-
-
-def _nodes(ends: Matrix, count: int) -> Matrix:
-    """Equally spaced delays between ends (paths, 2), (paths, count)."""
-    return np.asarray(ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0, 1, count))

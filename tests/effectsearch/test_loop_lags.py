@@ -130,12 +130,12 @@ def test_a_linear_effect_is_weighed_with_its_parameters_and_named_where_lags_hav
     free = sum(row.free and row.kind in ("gain", "delay", "time", "order") for row in rows)
     square = float((state.whitening(optimum.residual) ** 2).sum())
     best = one.search.best
-    expected = square + 2 * (free + 1) - best.square - 2 * best.parameters
+    expected = square + 2 * (free + 1) - min(one.search.fits[lags - 1].aic for lags in one.search.lags)
     assert one.advantage == pytest.approx(expected, abs=0.1)
     quiet = chain.base.noise_samples
     assert linear_dynamics(lagged, [one], quiet, -np.inf)
     # without support they still follow as well unless the effect is ahead by more than chance gives
-    far, ahead = replace(one, advantage=-11.0), 0.5 * (best.square - square)
+    far, ahead = replace(one, advantage=-11.0), 0.5 * (best.misfit - square)
     assert linear_dynamics(lagged, [far], quiet, ahead + 0.1)
     assert not linear_dynamics(lagged, [far], quiet, ahead - 0.1)
     assert not linear_dynamics(lagged, [one], [100_000], 8.0)  # its residual is too large for that noise

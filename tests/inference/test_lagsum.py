@@ -110,6 +110,20 @@ def test_bic_finds_the_number_of_lags_and_more_never_fit_worse() -> None:
         assert abs(fits[1].square - fits[1].size) < 5 * np.sqrt(2 * fits[1].size)
 
 
+def test_akaikes_criterion_is_of_the_residual_alone() -> None:
+    """Second method: what the most probable weights leave of the record, and their own square. Weights of two
+    lags that are hardly apart are many ranges of the record large."""
+    for seed in range(2):
+        table = tabulated(lag_problem(made(seed)))
+        two = lag_fits(table)[1]
+        columns = table.columns(two.coordinates[None])[0]
+        weights = np.linalg.solve(columns @ columns.T + np.eye(2) / WEIGHT**2, columns @ table.target)
+        left = float(np.sum((table.target - weights @ columns) ** 2)) + table.remainder
+        assert two.misfit == pytest.approx(left, rel=1e-9)
+        assert two.weights == pytest.approx(float(weights @ weights) / WEIGHT**2, rel=1e-6)
+        assert two.aic == pytest.approx(left + 2 * 5)
+
+
 def test_records_of_twice_the_noise_have_a_quarter_of_the_square() -> None:
     problem = lag_problem(made())
     nodes = np.linspace(0.2, 0.7, 33)[None]

@@ -16,17 +16,9 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.diffusion import rises
+from lcopa_bayes.inference.lagsearch import LagSearch, likely
 from lcopa_bayes.inference.lagsum import lag_problem
-from lcopa_bayes.sampling.lagdraws import (
-    LagDraws,
-    LagMixture,
-    LagSearch,
-    _begun,
-    _walked,
-    _weighted,
-    lag_draws,
-    likely,
-)
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagMixture, _begun, _walked, _weighted, lag_draws
 
 ENDS = np.array([[0.0, 1.0]])
 
