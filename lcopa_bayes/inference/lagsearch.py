@@ -113,8 +113,7 @@ def likely(searches: Sequence[LagSearch]) -> tuple[LagSearch, ...]:
 def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
     """Ends between which delays are, (paths, 2): those of every likely number of lags and around."""
     best = best_of(fits)
-    likely = [one for one in fits if one.bic < best.bic + _NEAR]
-    places = np.array([one.coordinates[-table.paths :] for one in likely])
+    places = np.array([one.coordinates[-table.paths :] for one in fits if one.bic < best.bic + _NEAR])
     reach = (
         _REACH * np.sqrt(np.diag(best.covariance)[-table.paths :]) + table.delays[:, 1] - table.delays[:, 0]
     )
