@@ -37,8 +37,9 @@ _SHORTEST, _LONGEST = 0.5, 3.0
 what is slower cannot be told from a drift."""
 _INSTANT = 0.02
 """Shortest time constant that is tabulated, for lags that are part of a diffusion [sampling period]."""
-WEIGHT = 1.0
-"""Prior standard deviation of a weight, in ranges of response over ranges of drive [-]."""
+WEIGHT = 3.0
+"""Prior standard deviation of a weight, in ranges of response over ranges of drive [-]: partial fractions of
+a product of lags have weights of a few ranges, of either sign."""
 _VISIBLE = 1e-4
 """Squared part of a whitened response per unit weight that may be in no direction that is kept [-]."""
 _SAMPLES = 4_000

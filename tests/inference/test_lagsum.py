@@ -124,6 +124,15 @@ def test_akaikes_criterion_is_of_the_residual_alone() -> None:
         assert two.aic == pytest.approx(left + 2 * 5)
 
 
+@pytest.mark.parametrize("times", [(4.0, 2.0), (7.0, 3.0, 1.2), (5.0, 2.0, 0.8)])
+def test_the_prior_of_weights_says_little_against_a_product_of_lags(times) -> None:
+    """Less than half a nat against the partial fractions of unit gain."""
+    own = np.array(times)
+    residues = [t ** (own.size - 1) / np.prod(t - own[own != t]) for t in own]
+    assert np.sum(residues) == pytest.approx(1.0)
+    assert 0.5 * float(np.sum(np.square(residues))) / WEIGHT**2 < 0.5
+
+
 def test_records_of_twice_the_noise_have_a_quarter_of_the_square() -> None:
     problem = lag_problem(made())
     nodes = np.linspace(0.2, 0.7, 33)[None]
