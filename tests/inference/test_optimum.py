@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -12,6 +14,7 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.noise import White
 from lcopa_bayes.inference.optimum import along_orders, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -140,6 +143,26 @@ def test_finds_the_delay_among_the_local_minima_of_a_random_binary_drive():
         high = posterior.log_density(posterior.coordinates(least.with_noise(end)[None]))[0]
         assert high < mode.log_density - 50 or not trapped[-1]
     assert any(trapped)  # one start would not have been enough
+
+
+def test_a_plant_nearby_is_a_start_whatever_noise_it_comes_with():
+    """Also under a noise model without some of the noise parameters, which then stay as they were: outside
+    their prior they would leave no density where the descent ends."""
+    rng = np.random.default_rng(1)
+    command = prbs(-1.0, 1.0, hold=0.8, duration=30.0, rng=rng)
+    fast = Device(((path(1.0, 2.37, (0.15,), (0.9,)),),), TWO.drive_axes[:1], TWO.response_axes[:1], (0.0,))
+    noisy = record(device=fast, command=command, camera=0.1, duration=32.0, noise_sd=0.05)
+    posterior = replace(made(noisy, noise="white+ar1"), noise=White())
+    table, seen = posterior.table, []
+    at, near = table.at("delay", 0), table.draw(1, rng)[0]
+    near[[table.at("time", 0, 0), table.at("order", 0, 0)]] = 0.15, 0.9
+    near[[table.at("sigma_ar", 0), table.at("rho", 0)]] = 10.0, 0.0
+    for delay in (0.5, 4.5, 6.5):  # descents from some of these end beside the optimum
+        near[at] = delay
+        found = find_optima(posterior, np.random.default_rng(0), starts=1, near=[near])
+        assert found[0].values[at] == pytest.approx(2.37, abs=0.02)
+        seen += [one.values[at] for one in found[1:]]
+    assert any(abs(delay - 2.37) > 0.5 for delay in seen)
 
 
 def test_optima_are_distinct_finite_sorted_and_describe_their_surroundings():
