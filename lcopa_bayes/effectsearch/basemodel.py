@@ -224,7 +224,7 @@ def _based(
     fit = _fit(problem, key, contained, again, crew)
     narrow = narrowed(problem, partial(_shift, fit))
     if narrow is not problem:
-        problem, near = narrow, [fit.optimum.x]  # on wider blocks, but of the same mode or beside it
+        problem, near = narrow, [fit.optimum.x]  # of the same mode, or of one beside it
         rng, model = np.random.default_rng([study.seed, 10, *key]), ExtendedModel(narrow.posterior)
         fit = base_fit(model, rng, starts=1, near=near, crew=crew)
     return Base(problem, fit, _state(study, fit), "")

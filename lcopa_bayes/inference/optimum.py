@@ -88,7 +88,7 @@ def find_optima(
         return optima_near(posterior, effect_starts(posterior, [one.values for one in alone], rng))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     poles = regressed(posterior, drawn)
-    # a plant is near, not its noise: of that no estimate follows where another noise model is searched with
+    # parameters that only another noise model has are not estimated: they stay, perhaps outside their prior
     noise = np.array([row.free and row.noise for row in table.rows])
     near = [np.where(noise, drawn[0], values) for values in near]
     drawn = nearly_white(posterior, np.vstack([poles, drawn, *near]))
