@@ -15,6 +15,7 @@ from small import U, Y
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference import lagsum
 from lcopa_bayes.inference.diffusion import rises
 from lcopa_bayes.inference.lagsearch import LagSearch, likely
 from lcopa_bayes.inference.lagsum import lag_problem
@@ -195,10 +196,15 @@ def test_more_lags_than_the_best_and_one_are_begun_too() -> None:
         assert (begun.draw(50, np.random.default_rng(1))[:, :-1] < 30.0).all()
 
 
-def test_the_first_mixture_is_where_everything_else_settles_beside_a_spare_lag() -> None:
-    """By what its draws are worth: 0.087, with masses of another sign 0.063 or 0.069, unsettled 0.047."""
+@pytest.mark.parametrize(("weight", "seeds", "least"), [(1.0, 3, 0.2), (lagsum.WEIGHT, 10, 0.078)])
+def test_the_first_mixture_is_where_everything_else_settles_beside_a_spare_lag(
+    monkeypatch, weight, seeds, least
+) -> None:
+    """By what its draws are worth: without settling, or with masses of another sign, a sixth or more less;
+    0.087 of the second, whose weights are as wide as they are, then 0.047, 0.063 or 0.069."""
+    monkeypatch.setattr(lagsum, "WEIGHT", weight)
     search, shares = searched(), []
-    for seed in range(10):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         begun = _begun(search, search.best.lags + 1, rng)
         drawn = begun.draw(6_000, rng)
@@ -207,4 +213,4 @@ def test_the_first_mixture_is_where_everything_else_settles_beside_a_spare_lag()
         density[(np.diff(log_times, axis=2) < 0).any(axis=(1, 2))] = -np.inf
         weight = np.exp(density - density.max())
         shares.append(weight.sum() ** 2 / (weight**2).sum() / len(drawn))
-    assert np.mean(shares) > 0.078
+    assert np.mean(shares) > least
