@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logit, logsumexp
 from scipy.stats import median_abs_deviation
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
@@ -214,11 +214,9 @@ def _estimated(
     jitter = rng.uniform(-0.5, 0.5, (2, _DRAWS))
     mean = means[row, column] + jitter[0] * (means[row, 1] - means[row, 0])
     spread = spreads[row, 0] * (high / low) ** (jitter[1] / (_FINE - 1))
-    odd = sum(
-        mass[:, k]
-        @ np.exp(np.log(one) + outside - np.logaddexp(np.log1p(-one) + inside, np.log(one) + outside))
-        for k, one in enumerate(shares)
-    )
+    odds = outside - inside
+    odd = sum(mass[:, k] @ expit(odds + logit(share)) for k, share in enumerate(shares))
+    inlying = sum(mass[:, k] @ expit(-odds - logit(share)) for k, share in enumerate(shares))
     some = rng.choice(_DRAWS, _FEWER, replace=False)
     shrunk = _shrunk(nodes, mean[some], spread[some] ** 2, shares[share[some]], broad, rng)
     following = mean + spread * rng.standard_normal(_DRAWS)
@@ -234,7 +232,7 @@ def _estimated(
         )[1]
         for x, before in zip(draws, log_prior, strict=True)
     ]
-    return (mean, spread, following, shrunk, np.asarray(odd)), np.array(k)
+    return (mean, spread, following, shrunk, np.asarray(odd / (odd + inlying))), np.array(k)
 
 
 def _ridge(centre: Vector, variance: Vector, spreads: Vector) -> tuple[Vector, Vector]:

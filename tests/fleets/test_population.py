@@ -118,6 +118,15 @@ def test_three_odd_devices_are_found_and_leave_the_population_alone():
     assert np.median(found.shrunk[39]) == pytest.approx(np.median(draws[39]), abs=0.2)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_device_far_away_is_odd_with_a_probability_of_one_and_no_more(seed):
+    rng = np.random.default_rng(seed)
+    _, _, _, draws = fleet(20, rng)
+    odd = population_of([*draws[:-1], draws[-1] + 40.0], flat(draws), rng).odd
+    assert odd.min() > 0
+    assert 1 - 1e-12 < odd[-1] <= 1
+
+
 def test_the_prior_that_draws_were_made_under_is_divided_out():
     """Devices under a normal prior whose mean is wrong by its standard deviation."""
     rng = np.random.default_rng(8)
