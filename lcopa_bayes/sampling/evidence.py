@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.optimize import brentq
+from scipy.special import log_expit, logsumexp
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.inference.posterior import Posterior
@@ -29,7 +30,9 @@ _TENTATIVE = 2.0
 _BRIDGED = 3_000
 """Draws of each side of a bridge."""
 _SETTLED = 1e-10
-"""Change of the log ratio at which the iteration of a bridge stops [nat]."""
+"""Accuracy of the log ratio of a bridge [nat]."""
+_BEYOND = 50.0
+"""Distance of the ends between which the log ratio is sought from all that draws give [nat]."""
 
 
 @final
@@ -101,17 +104,24 @@ def bridge(posterior_side: Vector, mixture_side: Vector, ess: float) -> tuple[fl
     there, not everywhere.
     """
     ess = min(ess, float(posterior_side.size))
-    centre = float(np.median(posterior_side))
-    first, second = posterior_side - centre, mixture_side - centre
-    share = np.log(ess / (ess + second.size)), np.log(second.size / (ess + second.size))
-    ratio, change = 0.0, np.inf
-    while abs(change) > _SETTLED:
-        at_first = -np.logaddexp(share[0] + first, share[1] + ratio)
-        at_second = second - np.logaddexp(share[0] + second, share[1] + ratio)
-        new = float(logsumexp(at_second) - np.log(second.size) - logsumexp(at_first) + np.log(first.size))
-        ratio, change = new, new - ratio
-    error = _relative_variance(at_first) / ess + _relative_variance(at_second) / second.size
-    return ratio + centre, float(np.sqrt(error))
+    level = np.log(mixture_side.size / ess)
+    sides = np.concatenate((posterior_side, mixture_side))
+    reach = abs(level) + _BEYOND
+
+    def terms(ratio: float) -> tuple[Vector, Vector]:
+        """Logarithms of what the draws of either side count, (n,) each."""
+        return log_expit(ratio + level - posterior_side), log_expit(mixture_side - ratio - level)
+
+    def excess(ratio: float) -> float:
+        """Falls with the ratio, through 0 where iterating on it (Meng and Wong, eq. 4.1) would stay."""
+        first, second = terms(ratio)
+        return float(logsumexp(second) - logsumexp(first) + np.log(first.size / ess))
+
+    low, high = sides[sides > -np.inf].min() - reach, sides.max() + reach
+    ratio = float(brentq(excess, low, high, xtol=_SETTLED))
+    first, second = terms(ratio)
+    error = _relative_variance(first) / ess + _relative_variance(second) / second.size
+    return ratio, float(np.sqrt(error))
 
 
 def _relative_variance(log_terms: Vector) -> float:

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import dblquad
 from scipy.special import logsumexp
@@ -63,6 +65,23 @@ def test_a_bridge_takes_what_lies_outside():
     value, error = bridge(np.full(1000, np.log(2.0)), np.where(inside, np.log(2.0), -np.inf), 1000.0)
     assert abs(value) < 4 * error
     assert error == pytest.approx(1 / np.sqrt(4000), rel=0.3)  # a share of one half of 4000 draws
+
+
+@pytest.mark.parametrize("gap", [0.0, 30.0, 1e4, 1e8])
+def test_a_bridge_between_sides_that_never_meet_ends_in_the_middle(gap):
+    """By symmetry; iterations on the ratio take steps that shrink with the exponential of the gap."""
+    value, _ = bridge(np.zeros(40), np.full(40, -gap), 40.0)
+    assert value == pytest.approx(-gap / 2, abs=1e-6)
+
+
+@given(st.integers(0, 2**32), st.floats(0.0, 300.0), st.floats(0.1, 30.0))
+def test_a_bridge_is_where_its_iteration_would_stay(seed, gap, spread):
+    rng = np.random.default_rng(seed)
+    ours, theirs = rng.normal(0.0, 1.0, 50), rng.normal(-gap, spread, 80)
+    value, _ = bridge(ours, theirs, 20.0)
+    above = logsumexp(theirs - np.logaddexp(np.log(0.2) + theirs, np.log(0.8) + value)) - np.log(80)
+    below = logsumexp(-np.logaddexp(np.log(0.2) + ours, np.log(0.8) + value)) - np.log(50)
+    assert above - below == pytest.approx(value, abs=1e-6)
 
 
 def test_correlated_draws_are_worth_fewer():
