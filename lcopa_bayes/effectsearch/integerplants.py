@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from math import log
 from typing import final
 
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.lags import linear
@@ -82,7 +83,7 @@ class IntegerPlant:
         return f"integer orders ({said_of(self.orders)}; {self.log_odds:+.1f} nat by BIC)"
 
 
-def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
+def integer_plant(state: State, problem: Problem, crew: Crew = ALONE) -> IntegerPlant | None:
     """The plant of a final state with integer orders of all elements of one or two terms that the records let
     have them; None without any. With effects it is fitted to the records less these first."""
     try:
@@ -91,7 +92,7 @@ def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
         return None
 
     def held(orders: Orders) -> IntegerPlant | None:
-        found = _held(bare, problem, orders)
+        found = _held(bare, problem, orders, crew)
         if found is None or bare is state:
             return found
         return _with_effects(state, found) if found.log_odds > log(LEAST) - _DOUBT else None
@@ -99,7 +100,7 @@ def integer_plant(state: State, problem: Problem) -> IntegerPlant | None:
     return most_likely(dict(nearest(bare.model.plant.table, bare.model.values(bare.optimum.x))), held)
 
 
-def integer_dynamics(state: State, problem: Problem) -> Dynamics | None:
+def integer_dynamics(state: State, problem: Problem, crew: Crew = ALONE) -> Dynamics | None:
     """A plant with integer orders and without the effects of a final state, where it follows the fitted
     records as well, to the noise; None where it does not, or where an effect is nonlinear or changes with
     time."""
@@ -111,7 +112,7 @@ def integer_dynamics(state: State, problem: Problem) -> Dynamics | None:
         bare = replace(state, model=model, optimum=Regression(model, state.whitening).descend(x))
     except ArithmeticError:
         return None
-    found = integer_plant(bare, problem)
+    found = integer_plant(bare, problem, crew)
     if found is None:
         return None
     own = found.plant.state.optimum
@@ -129,7 +130,7 @@ def _saved(state: State, size: int) -> float:
     return 0.5 * (state.optimum.x.size - size) * log(state.whitening.effective)
 
 
-def _held(state: State, problem: Problem, orders: Orders) -> IntegerPlant | None:
+def _held(state: State, problem: Problem, orders: Orders, crew: Crew) -> IntegerPlant | None:
     """The plant of a state without effects with these elements at integer orders; None where it cannot follow
     the records."""
     table = state.model.plant.table
@@ -138,7 +139,7 @@ def _held(state: State, problem: Problem, orders: Orders) -> IntegerPlant | None
         model = following(ExtendedModel(own.posterior), state.whitening.samples)
         values = state.model.values(state.optimum.x)
         begun = [model.coordinates(one) for one in starts(table, values, model.plant.table, orders)]
-        optimum = Regression(model, state.whitening).best(begun)
+        optimum = Regression(model, state.whitening).best(begun, crew)
         model = model.at_scales(optimum.x, campaign_places(own.study))
     except (ArithmeticError, InputError):
         return None

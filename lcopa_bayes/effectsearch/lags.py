@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.lesseffects import added, samples_less
 from lcopa_bayes.effectsearch.openeffects import Weighed
@@ -40,10 +41,10 @@ _CHANCE = 0.99
 """Probability up to which chance explains a residual above the noise [-]."""
 
 
-def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
+def lags_of(state: State, problem: Problem, crew: Crew = ALONE) -> tuple[Alternative, ...]:
     """Sums of lags beside the plant of a final model and its linear effects, of each response axis that has
     any."""
-    return lags_beside(fitted_plant(state, problem))
+    return lags_beside(fitted_plant(state, problem), crew=crew)
 
 
 def fitted_plant(state: State, problem: Problem) -> FittedPlant:

@@ -261,22 +261,22 @@ def _looped(
     reached = Side.of(problem, searched.state)
     added = listed(named_effects(searched.state)) or "no effect"
     crew.stage(f"with {added} {reached.said}; holding other plants against it")
-    lags = lags_of(searched.state, problem) if chosen else ()
+    lags = lags_of(searched.state, problem, crew) if chosen else ()
     chance = searched.rounds[0].trace.threshold
     dynamics = linear_dynamics(searched.state, lags, fit.noise_samples, chance)
     if dynamics is None and chosen:
-        dynamics = integer_dynamics(searched.state, problem)
+        dynamics = integer_dynamics(searched.state, problem, crew)
     findings = findings_of(
         study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone
     )
     extended = searched.state.model.effects
     others = tuple(one.start for one in base.richer) if chosen else None
-    plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others)
+    plants = PlantsBeside() if extended else PlantsBeside.of(searched.state, problem, others, crew)
     lags = plants.held_against(lags, searched.state, problem)
     preferred = any(one.support == "lags" for one in lags)
     verdict = decide(replace(findings, linear=dynamics, preferred=preferred))
     if verdict.kind == "unexplained" and extended and chosen:
-        lags = lags_of(before.state, problem)  # beside the plant without them
+        lags = lags_of(before.state, problem, crew)  # beside the plant without them
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
@@ -303,7 +303,7 @@ def _looped(
     crew.stage(f"{verdict.kind}; weighing what else the records leave open")
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
     if extended:
-        plants = PlantsBeside.of(state, problem, others)
+        plants = PlantsBeside.of(state, problem, others, crew)
         lags = plants.held_against(lags, state, problem)
     return Loop(
         *(problem, fit, base.sentence, searched.rounds, state.model.effects),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self, final
 
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
 from lcopa_bayes.effectsearch.lags import fitted_plant
@@ -27,12 +28,12 @@ class PlantsBeside:
     integer: IntegerPlant | None = None
 
     @classmethod
-    def of(cls, state: State, problem: Problem, wider: Sequence[State] | None) -> Self:
+    def of(cls, state: State, problem: Problem, wider: Sequence[State] | None, crew: Crew = ALONE) -> Self:
         """Those beside a final state: of a base fit's `wider` states, and with integer orders; none of a
         plant whose structure is stated, where `wider` is None."""
         if wider is None:
             return cls()
-        return cls(RicherPlants.beside(state, wider), integer_plant(state, problem))
+        return cls(RicherPlants.beside(state, wider), integer_plant(state, problem, crew))
 
     def figures(self, figures: Sequence[Weighed], *, span: float, time_unit: str) -> tuple[Weighed, ...]:
         """Figures of the response to a unit step over `span` [time unit], over these plants too."""

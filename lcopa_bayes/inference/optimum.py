@@ -19,7 +19,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.pathstarts import beside_each_other
 from lcopa_bayes.inference.plantdescents import PlantDescents
 from lcopa_bayes.inference.poles import regressed
-from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.posterior import Posterior, portions
 from lcopa_bayes.inference.spareterms import beside_spare_terms
 from lcopa_bayes.model.effects.effect import UnstableError
 
@@ -76,7 +76,7 @@ def find_optima(
 ) -> tuple[Optimum, ...]:
     """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
     removed; the likeliest of further table values `near`, (rows,), is a start of its own. A `crew` that
-    shares the posterior descends from several starts at once.
+    shares the posterior screens draws and descends from several starts at once.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -92,7 +92,8 @@ def find_optima(
     noise = np.array([row.free and row.noise for row in table.rows])
     near = [np.where(noise, drawn[0], values) for values in near]
     drawn = nearly_white(posterior, np.vstack([poles, drawn, *near]))
-    each = posterior.log_likelihoods(drawn)
+    crew = crew or ALONE.sharing(posterior)
+    each = np.concatenate(list(crew.each(Posterior.log_likelihoods, portions(drawn))), axis=1)
     likelihood = each.sum(axis=0)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where

@@ -24,6 +24,11 @@ _PORTION = 128
 """Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
 
+def portions(values: Matrix) -> list[Matrix]:
+    """Parameter sets, (batch, rows), as many of them as are evaluated at once."""
+    return [values[first : first + _PORTION] for first in range(0, len(values), _PORTION)]
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Posterior:
@@ -141,8 +146,7 @@ class Posterior:
     def log_likelihoods(self, values: Matrix) -> Matrix:
         """The same of each response axis, (axes, batch)."""
         if values.shape[0] > _PORTION:
-            portions = (values[k : k + _PORTION] for k in range(0, values.shape[0], _PORTION))
-            return np.concatenate([self.log_likelihoods(portion) for portion in portions], axis=1)
+            return np.concatenate([self.log_likelihoods(some) for some in portions(values)], axis=1)
         units = self.responses(values)
         out = np.zeros((len(self.table.layout.responses), values.shape[0]))
         for axis, total in enumerate(out):
@@ -201,8 +205,8 @@ class Posterior:
     def joint_log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of canonical values, linear parameters included, (batch,) [nat]."""
         out = []
-        for first in range(0, values.shape[0], _PORTION):
-            records = self.pointwise(values[first : first + _PORTION])
+        for some in portions(values):
+            records = self.pointwise(some)
             out.append(np.sum([axis.sum(axis=1) for record in records for axis in record], axis=0))
         return np.concatenate(out)
 

@@ -18,6 +18,7 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.diffusion import KINDS, Kind
@@ -176,11 +177,12 @@ def _plant(fitted: Fit) -> FittedPlant | None:
     return FittedPlant(fitted.problem, best, noise, fitted.curves, fitted.run.plan.seed)
 
 
-def with_alternatives(fitted: Fit, integer: IntegerFit | None) -> Fit:
+def with_alternatives(fitted: Fit, integer: IntegerFit | None, *, jobs: int = 1) -> Fit:
     """A fit with the figures of its step responses over all plants, that with `integer` orders among them,
     and what follows for its grade."""
     own = _plant(fitted)
-    found = lags_beside(own) if own else ()
+    with Crew(min(jobs, len(own.noise)) if own else 1) as crew:
+        found = lags_beside(own, crew=crew) if own else ()
     if not found and integer is None:
         return fitted
     other = _plant(integer.draws) if integer else None

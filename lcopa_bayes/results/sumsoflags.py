@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.assembly import Problem
@@ -156,30 +157,20 @@ class FittedPlant:
 
 
 def lags_beside(
-    plant: FittedPlant, kinds: Sequence[Kind] = KINDS, *, single: bool = True
+    plant: FittedPlant, kinds: Sequence[Kind] = KINDS, *, single: bool = True, crew: Crew = ALONE
 ) -> tuple[Alternative, ...]:
     """Sums of lags of these kinds beside a fitted plant: for each response axis that has any one for all of
     its paths, or, if `single`, where this has no support, one for each path that has; none where no drive
-    moves or the records do not determine them."""
+    moves or the records do not determine them. A `crew` searches several axes at once."""
     try:
         own = plant.posterior
         followed = own if plant.samples is None else replace(own, samples=plant.samples)
         problem = lag_problem(plant.problem.study, followed)
     except InputError:
         return ()
-    out = []
-    for axis in range(len(plant.noise)):
-        paths = _open(plant.posterior, axis)
-        if not paths:
-            continue
-        every = _alternative(plant, problem, paths, (), kinds)
-        each: list[Alternative] = []
-        if single and every.support == "plant" and len(paths) > 1:
-            others = [tuple(other for other in paths if other != one) for one in paths]
-            pairs = zip(paths, others, strict=True)
-            each = [_alternative(plant, problem, (one,), beside, kinds) for one, beside in pairs]
-        out += [one for one in each if one.support != "plant"] or [every]
-    return tuple(out)
+    axes = [paths for axis in range(len(plant.noise)) if (paths := _open(own, axis))]
+    found = crew.sharing((plant, problem)).each(partial(_on_axis, kinds, single), axes)
+    return tuple(one for on_axis in found for one in on_axis)
 
 
 def held_against(
@@ -276,6 +267,22 @@ def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
         if row.free and moves:
             out.append(one)
     return tuple(out)
+
+
+def _on_axis(
+    kinds: Sequence[Kind], single: bool, beside: tuple[FittedPlant, Problem], paths: tuple[PathSlot, ...]
+) -> list[Alternative]:
+    """Those in place of all paths to one response axis, or of some of them, `beside` a plant whose records
+    the problem states for lags."""
+    plant, problem = beside
+    every = _alternative(plant, problem, paths, (), kinds)
+    each: list[Alternative] = []
+    if single and every.support == "plant" and len(paths) > 1:
+        others = [tuple(other for other in paths if other != one) for one in paths]
+        each = [
+            _alternative(plant, problem, (one,), rest, kinds) for one, rest in zip(paths, others, strict=True)
+        ]
+    return [one for one in each if one.support != "plant"] or [every]
 
 
 def _alternative(

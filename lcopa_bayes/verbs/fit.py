@@ -75,7 +75,7 @@ def fit(
         if structure:
             fitted = replace(fitted, structure=structure)
             integer = integer_fit(fitted, jobs=jobs, folder=place, resume=resume, quick=quick, quiet=quiet)
-            fitted = with_alternatives(fitted, integer)
+            fitted = with_alternatives(fitted, integer, jobs=jobs)
         if place is not None:
             fitted.save(place, compact=compact, jobs=jobs, page=page)
     return fitted

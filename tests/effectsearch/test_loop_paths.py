@@ -12,7 +12,8 @@ from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.core.crew import Crew
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
@@ -121,3 +122,17 @@ def test_linear_dynamics_of_one_path_are_named_as_such():
     dynamics = linear_dynamics(based().start, found(), based().fit.noise_samples, 0.0)
     assert dynamics is not None
     assert "lags follow y_u2" in dynamics.said
+
+
+def test_axes_that_are_searched_side_by_side_have_the_same_lags():
+    paths = (TransferPath.of_times(gain, 0.4, (time,), (1.0,)) for gain, time in ((1.0, 2.0), (0.5, 0.7)))
+    one, other = (record("run", (path,), seed) for seed, path in enumerate(paths))
+    both = np.hstack([one.response, other.response])
+    run = replace(one, response=both, response_axes=(Axis("x", "V"), Axis("y", "V")))
+    base = fitted_base(Study("both", None, "s", 3, (run,), ()), (), as_stated=True, draws=100)
+    alone = lags_of(base.start, base.problem)
+    with Crew(2) as crew:
+        together = lags_of(base.start, base.problem, crew)
+    assert [each.search.axis for each in alone] == [0, 1]
+    assert [each.as_json() for each in together] == [each.as_json() for each in alone]
+    np.testing.assert_array_equal(together[1].draws.gains, alone[1].draws.gains)
