@@ -179,7 +179,7 @@ class Contender:
 
     def _first(self) -> Fit:
         """The finished fit; else one by the short plan, or by the study's own where that leaves nothing
-        usable."""
+        usable and no budget of time ended it, as it would end the other."""
         if self.candidate.fit is not None:
             return whole(self.candidate.fit)
         if self.rejected:
@@ -188,7 +188,8 @@ class Contender:
             fitted = fit(study, quick=self.quick, around_optima=True)
             return replace(fitted, draws=fitted.draws.limited((_ROUGHLY,)))
         fitted = self._fitted(self.candidate.study, self.folder)
-        if fitted.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
+        useless = fitted.draws.grade.level == "unusable" and fitted.run.stopped_after is None
+        if useless and self.patient != self.candidate.study.sampler:
             longer = replace(self.candidate.study, sampler=self.patient)
             fitted = self._fitted(longer, None if self.folder is None else self.folder / "longer")
         return fitted

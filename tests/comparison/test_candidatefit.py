@@ -9,12 +9,15 @@ import pytest
 from small import record, study, with_effect
 
 from lcopa_bayes.bench.command import staircase
+from lcopa_bayes.comparison import candidatefit
 from lcopa_bayes.comparison.candidatefit import REJECTED, contender, laplace
 from lcopa_bayes.comparison.candidates import of_studies
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.predictivedensity import predictions
 from lcopa_bayes.data.settings import EffectsSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.sampling.convergence import Limitation
 
 TRUTH = {
     "gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.003, "coefficient": 0.4,
@@ -58,6 +61,23 @@ def test_what_its_optima_reject_is_sampled_around_them_alone(explained: Fit, pla
     assert plain.evidence is not None
     assert cards["plain"]["log_evidence"] == pytest.approx(plain.evidence.value, abs=0.5)
     assert laplace(plain.problem) == pytest.approx(plain.evidence.value, abs=3.0)
+
+
+@pytest.mark.parametrize(("stopped", "fits"), [(None, 2), (60.0, 1)])
+def test_a_candidate_is_fitted_again_unless_its_budget_ended_it(plain: Fit, monkeypatch, stopped, fits):
+    """The other plan would end at the same time."""
+    unusable = plain.draws.limited((Limitation("unusable", "no draw counts", "draw more"),))
+    run, plans = replace(plain.run, stopped_after=stopped), []
+
+    def fitted(study: Study, **_: object) -> Fit:
+        plans.append(study.sampler)
+        return replace(plain, draws=unusable, run=run)
+
+    monkeypatch.setattr(candidatefit, "fit", fitted)
+    (one, _) = of_studies([plain.study, plain.study], [None, None])
+    card = contender(one, None, quick=True, resume=False)()
+    assert card["grade"] == "unusable"
+    assert len(plans) == fits
 
 
 def test_what_is_not_far_behind_is_sampled_in_full(plain: Fit):
