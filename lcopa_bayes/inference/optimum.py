@@ -93,7 +93,7 @@ def find_optima(
     near = [np.where(noise, drawn[0], values) for values in near]
     drawn = nearly_white(posterior, np.vstack([poles, drawn, *near]))
     crew = crew or ALONE.sharing(posterior)
-    each = np.concatenate(list(crew.each(Posterior.log_likelihoods, portions(drawn))), axis=1)
+    each = _screened(crew, drawn)
     likelihood = each.sum(axis=0)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
@@ -102,7 +102,7 @@ def find_optima(
     begun = _distinct(posterior, ranked, starts)
     count = min(_FURTHER_STARTS, max(1, starts // 2))
     likely = drawn[: len(poles)][np.argsort(-likelihood[: len(poles)], kind="stable")]
-    further = [_of_several_paths(posterior, one, starts)[:count] for one in (ranked, likely)]
+    further = [_of_several_paths(posterior, one, starts, crew)[:count] for one in (ranked, likely)]
     begun = _distinct(posterior, np.vstack([*begun, *further]), starts + 2 * count)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
@@ -114,10 +114,15 @@ def find_optima(
     return _to_its_digits(posterior, found)
 
 
-def _of_several_paths(posterior: Posterior, drawn: Matrix, starts: int) -> Matrix:
+def _screened(crew: Workers[Posterior], values: Matrix) -> Matrix:
+    """Log likelihoods of table values, (axes, batch), by a crew that shares the posterior."""
+    return np.concatenate(list(crew.each(Posterior.log_likelihoods, portions(values))), axis=1)
+
+
+def _of_several_paths(posterior: Posterior, drawn: Matrix, starts: int, crew: Workers[Posterior]) -> Matrix:
     """Starts in which paths have draws of their own, likeliest first; none where all share."""
     found = beside_each_other(posterior, drawn, starts)
-    return _ranked(posterior.table, found, posterior.log_likelihoods(found)) if len(found) else found
+    return _ranked(posterior.table, found, _screened(crew, found)) if len(found) else found
 
 
 def _ranked(table: ParameterTable, values: Matrix, likelihoods: Matrix) -> Matrix:
