@@ -171,5 +171,13 @@ def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], lis
         end = f"at line {text.count(chr(10)) + 1}, the end of the file"
         why = str(error).replace("at end of document", end)
         raise InputError(f"{path}: is not valid TOML: {why}") from error
-    wrong = [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in tables if key not in known]
+    wrong = [f"{path}: {_misplaced(key, value, known)}" for key, value in tables.items() if key not in known]
     return tables, wrong
+
+
+def _misplaced(key: str, value: object, known: Collection[str]) -> str:
+    """What is wrong with an entry that no table of a file is named like."""
+    entries = value if isinstance(value, list) and value else [value]
+    if all(isinstance(one, dict) for one in entries):
+        return f"unknown table [{key}]{nearest(key, known)}"
+    return f"key {key!r} stands above all tables; put it below the one it belongs to: [{'], ['.join(known)}]"

@@ -172,7 +172,8 @@ def test_every_setting_arrives(tmp_path):
     ("text", "words"),
     [
         ("[modl]\nterms = 1", ["unknown table [modl]", "'model'"]),
-        ("seed = 1", ["[seed]"]),
+        ("[[candidate]]\nname = 3", ["unknown table [candidate]", "'candidates'"]),
+        ("seed = 1", ["key 'seed' stands above all tables", "[study]"]),
         ('[study]\nnam = "a"', ["[study]", "unknown key 'nam'", "'name'"]),
         ('[study]\nname = "a/b"', ["[study]", "`name`", "'a/b'"]),
         ("[study]\nname = 3", ["[study]", "`name`", "3"]),
