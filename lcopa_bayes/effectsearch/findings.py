@@ -16,6 +16,7 @@ from lcopa_bayes.effectsearch.rounds import Search
 from lcopa_bayes.effectsearch.scores import (
     Score,
     State,
+    apart,
     fit_scores,
     held_out_scores,
     left_out_scores,
@@ -26,6 +27,10 @@ from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, RISEN, Findings
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.sampling.draws import Draws
+
+_AWAY = 2.0
+"""Distance of what draws predict from the prediction at the optimum beyond which they are elsewhere [sd of
+the latter]."""
 
 
 @final
@@ -113,5 +118,8 @@ def findings_of(
 
 
 def astray(optimum: Side, drawn: Side) -> bool:
-    """Whether draws predict records held out worse than the optimum of the loop."""
-    return bool(optimum.unseen[0].held_out) and risen(optimum.unseen, drawn.unseen) > RISEN
+    """Whether draws predict records held out worse than the optimum of the loop, and beyond what that leaves
+    open: a mean of draws that are right is a part of a standard deviation off."""
+    if not optimum.unseen[0].held_out or not risen(optimum.unseen, drawn.unseen) > RISEN:
+        return False
+    return not apart(optimum.unseen, drawn.unseen) <= _AWAY  # without a band nothing is known to be open

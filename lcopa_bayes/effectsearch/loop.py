@@ -299,6 +299,7 @@ def _looped(
         cautions = (*cautions, _ASTRAY)
     elif drawn is not None:
         after, sampled = drawn, drawn.state.sampled
+        before = before if named else after
     after = Side.of(problem, state) if sampled is None and state is not after.state else after
     crew.stage(f"{verdict.kind}; weighing what else the records leave open")
     found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()

@@ -361,6 +361,20 @@ def risen(before: Sequence[Score], after: Sequence[Score]) -> float:
     return max(ratios, default=float("nan"))
 
 
+def apart(one: Sequence[Score], other: Sequence[Score]) -> float:
+    """Largest distance of any axis between two predictions of the same samples, over the standard deviation
+    that the first leaves open, root mean squares [-]; NaN without a band."""
+    ratios = []
+    for axis in sorted({score.axis for score in one}):
+        pairs = [(a, b) for a, b in zip(one, other, strict=True) if a.axis == axis]
+        square = np.concatenate([np.square(a.predicted - b.predicted) for a, b in pairs])
+        variance = np.concatenate([a.variance for a, _ in pairs])
+        known = np.isfinite(variance)
+        if known.any():
+            ratios.append(float(np.sqrt(square[known].sum() / variance[known].sum())))
+    return max(ratios, default=float("nan"))
+
+
 def over_noise(fit: Sequence[Score], unseen: Sequence[Score], *, clear: bool) -> float:
     """Largest root mean square error of any axis on unseen records over the noise [-]; NaN without samples.
 

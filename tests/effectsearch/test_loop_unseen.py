@@ -15,7 +15,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.findings import Side
+from lcopa_bayes.effectsearch.findings import Side, astray
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.scores import State, risen
@@ -133,6 +133,29 @@ def test_a_record_beyond_the_fitted_drives_is_not_clean_where_the_model_fails_th
         larger = replace(other, drive=2 * other.drive, response=response)
         found = loop(replace(study, held_out=(larger,)), library=[], sample=False, quick=True, as_stated=True)
         assert found.verdict.kind == kind
+
+
+@pytest.mark.parametrize(
+    ("away", "open_to", "kind"),
+    [(0.8, 1.0, False), (-0.8, 1.0, False), (0.8, 0.1, True), (-0.8, 0.1, False), (0.8, np.nan, True)],
+)
+def test_draws_are_astray_where_they_are_worse_beyond_what_the_optimum_leaves_open(away, open_to, kind):
+    """A held-out record lies 0.8 noise below its prediction, that of draws as far above or below it; the
+    optimum leaves so much open, in the same unit, or says nothing of it."""
+    side, _ = fitted(campaign("white", 4))
+    (score,) = side.unseen
+    shift = SD * np.ones(score.time.size)
+    below = replace(score, observed=score.observed - 0.8 * shift, variance=(open_to * shift) ** 2)
+    drawn = replace(below, predicted=below.predicted + away * shift)
+    assert (risen([below], [drawn]) > RISEN) == (away > 0)
+    assert astray(replace(side, unseen=(below,)), replace(side, unseen=(drawn,))) is kind
+
+
+def test_draws_of_a_clean_campaign_are_of_one_model_before_and_after():
+    found = loop(campaign("white", 4), library=[], quick=True, as_stated=True)
+    assert found.verdict.kind == "clean"
+    assert found.draws is not None
+    assert found.before is found.after
 
 
 def test_a_plant_that_differs_on_held_out_records_is_not_clean():
