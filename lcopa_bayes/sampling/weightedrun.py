@@ -31,6 +31,7 @@ from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.run import Run, SamplePlan
+from lcopa_bayes.sampling.separateaxes import joined, of_factor, separated
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 STARTS, QUICK_STARTS = 4, 2
@@ -95,13 +96,10 @@ def weighted_run(
         if posterior.simulation is not None and _together(posterior, chosen):
             near, weighted, share = _by_surrogate(posterior, chosen[0], rng, size, mapped, late)
         if weighted is None or not usable(weighted):
-            tried = importance(posterior, optima, rng, wanted, mapped, late)
+            tried = _around(posterior, optima, rng, wanted, plan.delivered, mapped, late)
             if tried is None:
                 return None
-            near, weighted = posterior, tried.weighted
-            share = weighted.ess / weighted.count
-    if not usable(weighted):
-        return None
+            near, (weighted, share) = posterior, tried
     stopped = monotonic() - begin if late() else None
     run = Run((), plan, weighted, surrogate=near.surrogate, stopped_after=stopped)
     draws = gather(near, run)
@@ -118,6 +116,28 @@ def weighted_run(
             ]
         )
     return run, draws
+
+
+def _around(
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+    rng: np.random.Generator,
+    wanted: ImportancePlan,
+    count: int,
+    mapped: Mapped,
+    late: Callable[[], bool],
+) -> tuple[Weighted, float] | None:
+    """Importance draws around optima, and how efficient they are [-]; of every response axis by itself, and
+    then `count` of each batch, where axes share nothing. None where those of an axis are of no use."""
+    factors, drawn = separated(posterior, optima[0].values), list[Weighted]()
+    for factor in factors or (posterior,):
+        own = of_factor(factor, posterior, optima) if factors else optima
+        tried = importance(factor, own, rng, wanted, mapped, late)
+        if tried is None or not usable(tried.weighted):
+            return None
+        drawn.append(tried.weighted)
+    share = min(one.ess / one.count for one in drawn)
+    return joined(posterior, factors, drawn, count, rng) if factors else drawn[0], share
 
 
 def usable(weighted: Weighted) -> bool:

@@ -23,6 +23,7 @@ from lcopa_bayes.sampling.run import Run, SamplePlan
 from lcopa_bayes.sampling.sampler import sample
 from lcopa_bayes.sampling.separateaxes import separated
 from lcopa_bayes.sampling.weighted import Weighted
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 PAIR = Device(
     ((path(1.0, 0.3, (1.2,), (0.9,)),), (path(0.5, 0.8, (2.5,), (1.0,)),)),
@@ -82,6 +83,21 @@ def test_draws_of_the_axes_are_those_of_the_whole(
     other = sample(whole, plan(4))
     assert other.weighted is not None
     assert other.weighted.factors == ()
+    agree(whole, run, other)
+
+
+def test_importance_draws_around_the_optima_of_each_axis_are_those_of_the_search(
+    whole: Posterior, run: Run
+) -> None:
+    found = weighted_run(whole, plan(5))
+    assert found is not None
+    assert found[0].weighted is not None
+    assert len(found[0].weighted.factors) == 2
+    agree(whole, run, found[0])
+
+
+def agree(whole: Posterior, run: Run, other: Run) -> None:
+    """Means, spreads and evidence within their Monte Carlo errors."""
     ours, theirs = gather(whole, run), gather(whole, other)
     for name in whole.table.names:
         one, two = ours.column(name), theirs.column(name)
