@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.outliers import NAME, Outlying
-from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.optimum import Optimum, again, known_optimum, nearly_white
@@ -23,7 +24,9 @@ from lcopa_bayes.model.effects.effect import Effect, Ranges
 from lcopa_bayes.model.effects.records import Outliers
 from lcopa_bayes.results.discretisation import discretisation, resolved_optima
 from lcopa_bayes.results.fit import plan_of, weighted_start
-from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.draws import Draws, gather, shortfall
+from lcopa_bayes.sampling.run import Run
+from lcopa_bayes.sampling.sampler import by_search
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _DRAWS, _STREAM = 100, 13
@@ -102,8 +105,9 @@ def explained_draws(
     quick: bool = False,
 ) -> tuple[Draws, Noise] | None:
     """Draws of an explained study, of the posterior that a fit of it samples and limited by the width of its
-    blocks as there, and its noise; None where importance sampling does not hold, and a fit takes ensembles
-    from the prior. Parameters by name `near` an optimum spare the search for it.
+    blocks as there, and its noise; None where neither a search over orders, delays and noise nor importance
+    sampling around optima holds, and a fit takes ensembles. Parameters by name `near` an optimum spare the
+    search for it.
 
     Where normal draws about its optimum are not `usable` these are returned: the posterior is around there,
     and takes some ten thousand simulations.
@@ -121,13 +125,32 @@ def explained_draws(
     about = normal_draws(problem.posterior, optima[0], study.seed) if optima else None
     if about is not None and not usable(about, noise):
         return about, noise
-    plan = plan_of(problem, quick=False)
-    result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
+    result = _sampled(problem, optima, jobs=jobs, quick=quick)
     if result is None:
         return None
     run, draws = result
     width = discretisation(problem, draws, surrogate=run.surrogate, jobs=jobs)
     return draws.limited(width.limitations), noise
+
+
+def _sampled(
+    problem: Problem, optima: Sequence[Optimum], *, jobs: int, quick: bool
+) -> tuple[Run, Draws] | None:
+    """Importance draws around optima. Of a plant without effects those of a search, where a first proposal
+    around the optima is not close to the posterior: it costs as much as three such proposals, and fails less
+    often."""
+    posterior, plan = problem.posterior, plan_of(problem, quick=False)
+    around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima)
+    if posterior.simulation is not None or not optima:
+        return around()
+    first = around(attempts=1)
+    if first is not None and first[1].grade.level == "reliable":
+        return first
+    run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough)
+    if run is None:
+        return around()
+    draws = gather(posterior, run)
+    return run, draws.limited(shortfall(run, draws))
 
 
 def _values(posterior: Posterior, known: Mapping[str, float]) -> Vector:

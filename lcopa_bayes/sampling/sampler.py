@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -12,7 +12,7 @@ from time import monotonic
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import Workers, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
@@ -25,7 +25,8 @@ from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.outer import Outer, applies, unsearched
 from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.run import SURPLUS, Run, SamplePlan, filling_modes, finished
-from lcopa_bayes.sampling.separateaxes import Drawn, by_axis
+from lcopa_bayes.sampling.separateaxes import Drawn, by_axis, importance_by_axis
+from lcopa_bayes.sampling.weighted import Weighted
 
 _ROUND = 20
 """Draws kept per round and walker."""
@@ -120,17 +121,10 @@ def sample(
             return Run(separate[0], plan, separate[1], unconfirmed, stopped_after=stopped)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
-        mapped = searched and len(Outer(posterior).columns) <= _MAPPED
+        mapped = searched and _mapped(posterior)
         if not ensembles and mapped and known is None:
             with _points(quiet) as bar:
-                weighted, scouted = None, rough is not None and rough is not posterior
-                if rough is not None and scouted:
-                    with workers(rough, jobs=jobs) as scouts:
-                        search = Search(rough, plan.seed, scouts, bar, optima, left, (posterior, crew))
-                        weighted = search.run(wanted)
-                if weighted is None:
-                    search = Search(posterior, plan.seed, crew, bar, optima, left)
-                    weighted = search.run(wanted, direct=not scouted)
+                search, weighted = _searched(posterior, plan, crew, jobs, bar, optima, rough, left)
             if weighted is not None:
                 stopped = monotonic() - begin if search.unfinished else None
                 if stopped is None:
@@ -193,6 +187,66 @@ def sample(
                 done, lasted = done + 1, monotonic() - at
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
+
+
+def by_search(
+    posterior: Posterior,
+    plan: SamplePlan,
+    optima: Sequence[Optimum],
+    *,
+    jobs: int = 1,
+    rough: Posterior | None = None,
+) -> Run | None:
+    """The importance draws that `sample` begins with, of every axis by itself where axes share nothing; None
+    where no search is possible or gives any. `optima`, one or more, and `rough` as there."""
+    begin, unfinished = monotonic(), False
+    rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
+
+    def left() -> float:
+        return inf if plan.seconds is None else begin + plan.seconds - monotonic()
+
+    def drawn(factor: Posterior, own: Sequence[Optimum]) -> Weighted | None:
+        nonlocal unfinished
+        if not (applies(factor) and _mapped(factor)):
+            return None
+        alone, wider = replace(plan, seed=int(rng.integers(2**31))), rough if factor is posterior else None
+        with workers(factor, jobs=jobs) as crew, _points(quiet=True) as bar:
+            search, weighted = _searched(factor, alone, crew, jobs, bar, own, wider, left)
+        unfinished |= search.unfinished
+        return weighted
+
+    weighted = importance_by_axis(posterior, optima, drawn, plan.delivered, rng)
+    if weighted is None:
+        return None
+    return Run((), plan, weighted, stopped_after=monotonic() - begin if unfinished else None)
+
+
+def _mapped(posterior: Posterior) -> bool:
+    """Whether a search is tried on so many orders, delays and noise parameters."""
+    return len(Outer(posterior).columns) <= _MAPPED
+
+
+def _searched(
+    posterior: Posterior,
+    plan: SamplePlan,
+    crew: Workers[Posterior],
+    jobs: int,
+    bar: Progress,
+    optima: Sequence[Optimum],
+    rough: Posterior | None,
+    left: Callable[[], float],
+) -> tuple[Search, Weighted | None]:
+    """A search, and the importance draws it gives if any; of a `rough` posterior first, where that is
+    another."""
+    wanted, scouted = SURPLUS * plan.target_ess, rough is not None and rough is not posterior
+    if rough is not None and scouted:
+        with workers(rough, jobs=jobs) as scouts:
+            search = Search(rough, plan.seed, scouts, bar, optima, left, (posterior, crew))
+            weighted = search.run(wanted)
+        if weighted is not None:
+            return search, weighted
+    search = Search(posterior, plan.seed, crew, bar, optima, left)
+    return search, search.run(wanted, direct=not scouted)
 
 
 def _points(quiet: bool) -> Progress:

@@ -56,6 +56,24 @@ def by_axis(
     return side_by_side(posterior, factors, drawn, rng), None
 
 
+def importance_by_axis(
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+    drawn: Callable[[Posterior, Sequence[Optimum]], Weighted | None],
+    count: int,
+    rng: np.random.Generator,
+) -> Weighted | None:
+    """Importance draws from optima, one or more: `count` of each batch of all axes where these share nothing
+    and `drawn` gives some of every factor; else what that gives of the whole."""
+    factors, each = separated(posterior, optima[0].values), list[Weighted]()
+    for factor in factors:
+        weighted = drawn(factor, of_factor(factor, posterior, optima))
+        if weighted is None:
+            return None
+        each.append(weighted)
+    return joined(posterior, factors, each, count, rng) if factors else drawn(posterior, optima)
+
+
 def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
     """The factor of each response axis; none where axes share a parameter, or some are without samples.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from time import monotonic
 from typing import final
 
@@ -31,7 +32,7 @@ from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.run import Run, SamplePlan
-from lcopa_bayes.sampling.separateaxes import joined, of_factor, separated
+from lcopa_bayes.sampling.separateaxes import importance_by_axis
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 STARTS, QUICK_STARTS = 4, 2
@@ -71,10 +72,12 @@ def weighted_run(
     jobs: int = 1,
     quick: bool = False,
     optima: Sequence[Optimum] = (),
+    attempts: int | None = None,
 ) -> tuple[Run, Draws] | None:
     """Importance draws as a run, and its draws; None where no weights are usable.
 
-    `optima` are those of the posterior where they are known; else they are searched for. Deterministic given
+    `optima` are those of the posterior where they are known; else they are searched for. With `attempts` no
+    more proposals than these are fitted around them. Deterministic given
     the plan's seed, whatever `jobs` [processes]; with a budget of `plan.seconds`, after which no further
     proposal is fitted, on the speed of the machine too.
     """
@@ -86,6 +89,7 @@ def weighted_run(
     rng = np.random.default_rng([plan.seed, _STREAM])
     size = min(plan.target_ess, 400.0) if quick else plan.target_ess
     wanted = replace(_QUICK if quick else _PLAN, wanted=size)
+    wanted = replace(wanted, efforts=wanted.efforts[:attempts])
     with workers(None, jobs=jobs) as crew:
         mapped = crew.map
         optima = optima or find_optima(posterior, rng, starts=wanted.starts)
@@ -96,10 +100,12 @@ def weighted_run(
         if posterior.simulation is not None and _together(posterior, chosen):
             near, weighted, share = _by_surrogate(posterior, chosen[0], rng, size, mapped, late)
         if weighted is None or not usable(weighted):
-            tried = _around(posterior, optima, rng, wanted, plan.delivered, mapped, late)
-            if tried is None:
+            around = partial(_around, rng, wanted, mapped, late)
+            near, weighted = posterior, importance_by_axis(posterior, optima, around, plan.delivered, rng)
+            if weighted is None:
                 return None
-            near, (weighted, share) = posterior, tried
+            parts = [part for part, _ in weighted.factors] or [weighted]
+            share = min(one.ess / one.count for one in parts)
     stopped = monotonic() - begin if late() else None
     run = Run((), plan, weighted, surrogate=near.surrogate, stopped_after=stopped)
     draws = gather(near, run)
@@ -119,25 +125,16 @@ def weighted_run(
 
 
 def _around(
-    posterior: Posterior,
-    optima: Sequence[Optimum],
     rng: np.random.Generator,
     wanted: ImportancePlan,
-    count: int,
     mapped: Mapped,
     late: Callable[[], bool],
-) -> tuple[Weighted, float] | None:
-    """Importance draws around optima, and how efficient they are [-]; of every response axis by itself, and
-    then `count` of each batch, where axes share nothing. None where those of an axis are of no use."""
-    factors, drawn = separated(posterior, optima[0].values), list[Weighted]()
-    for factor in factors or (posterior,):
-        own = of_factor(factor, posterior, optima) if factors else optima
-        tried = importance(factor, own, rng, wanted, mapped, late)
-        if tried is None or not usable(tried.weighted):
-            return None
-        drawn.append(tried.weighted)
-    share = min(one.ess / one.count for one in drawn)
-    return joined(posterior, factors, drawn, count, rng) if factors else drawn[0], share
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+) -> Weighted | None:
+    """Importance draws around optima; None where they are of no use."""
+    tried = importance(posterior, optima, rng, wanted, mapped, late)
+    return None if tried is None or not usable(tried.weighted) else tried.weighted
 
 
 def usable(weighted: Weighted) -> bool:

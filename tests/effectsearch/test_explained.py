@@ -30,6 +30,7 @@ from lcopa_bayes.model.effects.commands import OverdrivePulse, RefreshHold
 from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.sampling.convergence import Limitation
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +161,32 @@ def test_constants_are_free_about_where_the_loop_left_them(bent: Loop):
     scale = 0.005 * model.effected.ranges.response[0]
     assert rows["vibration.a[r2]"].prior.parameters["scale"] == pytest.approx(scale)  # type: ignore[union-attr]
     assert explained_study(made, model).name == made.name == "small-explained"
+
+
+@pytest.mark.parametrize(("level", "searches"), [("reliable", 0), ("tentative", 1), (None, 1)])
+def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close(
+    monkeypatch, level: str | None, searches: int
+):
+    """Both give the same draws but for their Monte Carlo errors."""
+    run, search, found, given = explained.weighted_run, explained.by_search, [], []
+
+    def around(*given, attempts: int | None, **how):
+        assert attempts == 1  # the longer ones are for where no search gives any
+        found.append(run(*given, attempts=attempts, **how))
+        limited = found[-1][1].limited((Limitation("tentative", "not close", "search"),))
+        return {None: None, "reliable": found[-1], "tentative": (found[-1][0], limited)}[level]
+
+    monkeypatch.setattr(explained, "weighted_run", around)
+    monkeypatch.setattr(
+        explained, "by_search", lambda *a, **how: given.append(search(*a, **how)) or given[-1]
+    )
+    draws, _ = explained_draws(study(1), lambda draws, noise: True, quick=True)
+    assert len(given) == searches
+    assert draws.grade.level == "reliable"
+    own = found[0][1]
+    for name in ("gain", "time_1", "delay"):
+        sd, error = own.column(name).std(), np.sqrt(1 / own.ess + 1 / draws.ess)
+        assert draws.column(name).mean() == pytest.approx(own.column(name).mean(), abs=4 * sd * error)
 
 
 def test_a_clean_loop_leaves_the_study_as_it_was(bent: Loop):

@@ -14,13 +14,14 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling import sampler
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
 from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.run import Run, SamplePlan
-from lcopa_bayes.sampling.sampler import sample
+from lcopa_bayes.sampling.sampler import by_search, sample
 from lcopa_bayes.sampling.separateaxes import separated
 from lcopa_bayes.sampling.weighted import Weighted
 from lcopa_bayes.sampling.weightedrun import weighted_run
@@ -86,14 +87,20 @@ def test_draws_of_the_axes_are_those_of_the_whole(
     agree(whole, run, other)
 
 
-def test_importance_draws_around_the_optima_of_each_axis_are_those_of_the_search(
-    whole: Posterior, run: Run
+@pytest.mark.parametrize("searched", [False, True])
+def test_draws_from_the_optima_of_the_whole_are_made_axis_by_axis_too(
+    whole: Posterior, run: Run, searched: bool
 ) -> None:
-    found = weighted_run(whole, plan(5))
+    """Importance draws around them, and those of a search that begins there."""
+    optima = find_optima(whole, np.random.default_rng(6), starts=4)
+    if searched:
+        found = by_search(whole, plan(5), optima)
+    else:
+        found, _ = weighted_run(whole, plan(5), optima=optima) or (None, None)
     assert found is not None
-    assert found[0].weighted is not None
-    assert len(found[0].weighted.factors) == 2
-    agree(whole, run, found[0])
+    assert found.weighted is not None
+    assert len(found.weighted.factors) == 2
+    agree(whole, run, found)
 
 
 def agree(whole: Posterior, run: Run, other: Run) -> None:
