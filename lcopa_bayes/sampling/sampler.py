@@ -84,9 +84,7 @@ def sample(
     """
     begin = monotonic()
 
-    def left() -> float:
-        """What is left of the budget [s]."""
-        return inf if plan.seconds is None else begin + plan.seconds - monotonic()
+    left = partial(_left, plan, begin)
 
     def spent(more: float = 0.0) -> float | None:
         """Time taken, where the budget ends within half of what `more` takes [s]."""
@@ -201,9 +199,7 @@ def by_search(
     where no search is possible or gives any. `optima`, one or more, and `rough` as there."""
     begin, unfinished = monotonic(), False
     rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
-
-    def left() -> float:
-        return inf if plan.seconds is None else begin + plan.seconds - monotonic()
+    left = partial(_left, plan, begin)
 
     def drawn(factor: Posterior, own: Sequence[Optimum]) -> Weighted | None:
         nonlocal unfinished
@@ -219,6 +215,11 @@ def by_search(
     if weighted is None:
         return None
     return Run((), plan, weighted, stopped_after=monotonic() - begin if unfinished else None)
+
+
+def _left(plan: SamplePlan, begin: float) -> float:
+    """What is left of a budget of time [s]."""
+    return inf if plan.seconds is None else begin + plan.seconds - monotonic()
 
 
 def _mapped(posterior: Posterior) -> bool:
