@@ -24,7 +24,7 @@ from lcopa_bayes.model.effects.effect import Effect, Ranges
 from lcopa_bayes.model.effects.records import Outliers
 from lcopa_bayes.results.discretisation import discretisation, resolved_optima
 from lcopa_bayes.results.fit import plan_of, weighted_start
-from lcopa_bayes.sampling.draws import Draws, gather, shortfall
+from lcopa_bayes.sampling.draws import Draws, draws_of
 from lcopa_bayes.sampling.run import Run
 from lcopa_bayes.sampling.sampler import by_search
 from lcopa_bayes.sampling.weightedrun import weighted_run
@@ -148,10 +148,7 @@ def _sampled(
     if first is not None and first[1].grade.level == "reliable":
         return first
     run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough)
-    if run is None:
-        return around()
-    draws = gather(posterior, run)
-    return run, draws.limited(shortfall(run, draws))
+    return around() if run is None else (run, draws_of(posterior, run))
 
 
 def _values(posterior: Posterior, known: Mapping[str, float]) -> Vector:

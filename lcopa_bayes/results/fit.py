@@ -39,7 +39,7 @@ from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck
-from lcopa_bayes.sampling.draws import Draws, gather, shortfall
+from lcopa_bayes.sampling.draws import Draws, draws_of
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.run import Run, SamplePlan
@@ -226,8 +226,7 @@ def fit(
             optima=optima,
             rough=problem.rough,
         )
-        draws = gather(problem.posterior, run)
-        draws = draws.limited(shortfall(run, draws))
+        draws = draws_of(problem.posterior, run)
     check = None
     weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:

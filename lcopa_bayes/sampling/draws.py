@@ -120,6 +120,12 @@ class Draws:
         )
 
 
+def draws_of(posterior: Posterior, run: Run) -> Draws:
+    """The draws of a run (`gather`), limited by what they lack where a budget ended it."""
+    draws = gather(posterior, run)
+    return draws.limited(shortfall(run, draws))
+
+
 def shortfall(run: Run, draws: Draws) -> tuple[Limitation, ...]:
     """What the draws of a run that its budget ended lack, and how much more time would give it; nothing where
     they lack nothing."""

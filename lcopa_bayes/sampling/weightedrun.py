@@ -24,7 +24,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.sampling.convergence import Limitation, qualities
 from lcopa_bayes.sampling.coordinates import Mapped, spread
-from lcopa_bayes.sampling.draws import Draws, gather, shortfall
+from lcopa_bayes.sampling.draws import Draws, draws_of
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.importance import LEAST_EFFICIENCY, Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
@@ -108,8 +108,7 @@ def weighted_run(
             share = min(one.ess / one.count for one in parts)
     stopped = monotonic() - begin if late() else None
     run = Run((), plan, weighted, surrogate=near.surrogate, stopped_after=stopped)
-    draws = gather(near, run)
-    draws = draws.limited(shortfall(run, draws))
+    draws = draws_of(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
             [
