@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from small import ONE, problem, record
 from lcopa_bayes.bench.command import joint, on_off, prbs, staircase
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.packing import packed
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
@@ -442,6 +444,39 @@ def test_a_class_of_the_user(tmp_path):
     made = BASE.with_effects([kind()])
     reported = made.responses(VALUES, np.ones(1))
     assert apart(reported, [2 * y - 0.1 for y in PLAIN]) < 1e-12
+
+
+WRITTEN_AS_HERE = """
+from __future__ import annotations
+from dataclasses import dataclass
+from typing import ClassVar
+import numpy as np
+from lcopa_bayes.model.effects.effect import Card, ReadoutEffect, single
+
+@dataclass(frozen=True)
+class Power(ReadoutEffect):
+    power: float
+    estimated = single("c", 0.1)
+    card: ClassVar[Card] = Card("power", "output", "y -> y + c |y|^power", "here", "all", "gain")
+
+    @classmethod
+    def grid(cls, ranges):
+        return (cls(3.0),)
+
+    def seen(self, y, scene, psi):
+        return y + psi[0] * np.abs(y) ** self.power
+"""
+
+
+@pytest.mark.parametrize("name", ["power", "numpy"])
+def test_a_class_of_the_user_written_as_those_of_the_package(tmp_path, name):
+    """With constants, and annotations as text; in a file of any name, also that of a module it needs."""
+    (tmp_path / f"{name}.py").write_text(WRITTEN_AS_HERE)
+    before = dict(sys.modules)
+    kind = catalogue([f"{name}.py:Power"], tmp_path)["power"]
+    assert kind.grid(None)[0].constants == {"power": 3.0}
+    assert packed(kind(3.0)) is None  # a worker could not import its file
+    assert sys.modules == before
 
 
 def test_bad_classes_are_reported_together(tmp_path):

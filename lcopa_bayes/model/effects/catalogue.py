@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.model.effects import commands, dynamics, generic, parallel, records, response, sensor
@@ -68,11 +71,23 @@ def _from_file(text: str, folder: Path | None) -> object:
         raise InputError("expected file.py:Class")
     if not path.is_file():
         raise InputError(f"{path} is not a file")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(f"study file {path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with _importing(module):
+        spec.loader.exec_module(module)
     if not hasattr(module, wanted):
         raise InputError(f"{path} has no {wanted!r}{nearest(wanted, vars(module))}")
     return getattr(module, wanted)
+
+
+@contextmanager
+def _importing(module: ModuleType) -> Iterator[None]:
+    """List a module while it is executed, as dataclasses with annotations as text need it; not afterwards, so
+    that no worker is sent its name, from which it could not be imported."""
+    sys.modules[module.__name__] = module
+    try:
+        yield
+    finally:
+        del sys.modules[module.__name__]
