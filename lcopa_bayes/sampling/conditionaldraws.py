@@ -25,6 +25,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _WIDER = 1.1
 """Standard deviation of the Gaussians drawn from, over those of the expansion [-]."""
+_ROUNDING = 1e-10
+"""Least information added along every coordinate, over its own [-]."""
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -58,6 +60,7 @@ class _Block(NamedTuple):
 def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Generator) -> Kept:
     """One of `tries` draws for each expansion."""
     posterior, batch = conditional.posterior, len(at.values)
+    at = _definite(conditional, at)
     x, log_source, exists = _drawn(conditional, at, tries, rng)
     flat = x.reshape(batch * tries, -1)
     values, possible = conditional.values(flat, np.repeat(at.values, tries, axis=0))
@@ -89,6 +92,25 @@ def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Gene
     )
 
 
+def _definite(conditional: Conditional, at: Expanded) -> Expanded:
+    """Expansions whose information, with that of the widths, is positive definite.
+
+    Where one term is nearly all of D(s_0), changes of its time and of the gain cancel but for a part in 1e8
+    or less, and rounding is more than what is left: it is as large as the most negative curvature shows, in
+    coordinates of information 1, and curvature below that is not known.
+    """
+    prior = 1.0 / _widths(conditional, at) ** 2
+    own = np.maximum(np.diagonal(at.information, axis1=1, axis2=2), 0.0) + prior
+    eye, sd = np.eye(at.x.shape[1]), 1.0 / np.sqrt(own)
+    scaled = (at.information + eye * prior[:, None, :]) * sd[:, :, None] * sd[:, None, :]
+    rounding = np.full(len(own), _ROUNDING)
+    try:
+        np.linalg.cholesky(scaled + _ROUNDING * eye)
+    except np.linalg.LinAlgError:
+        rounding = np.maximum(rounding, -2.0 * np.linalg.eigvalsh(scaled)[:, 0])
+    return at._replace(information=at.information + eye * (rounding[:, None] * own)[:, None, :])
+
+
 def in_domain(posterior: Posterior, columns: Sequence[int], values: Matrix) -> Flags:
     """Whether table values lie in the domains of the rows `columns`, (batch,)."""
     out = np.ones(len(values), dtype=bool)
@@ -102,8 +124,6 @@ def _blocks(conditional: Conditional, at: Expanded) -> list[_Block]:
     """Gaussians of each element's shares in turn, then of the rest."""
     wide = _widths(conditional, at)
     precision = at.information + np.eye(at.x.shape[1]) / wide[:, None, :] ** 2
-    own = np.diagonal(precision, axis1=1, axis2=2)
-    precision = precision + 1e-10 * np.eye(at.x.shape[1]) * own[:, None, :]
     pull = (precision @ at.x[..., None])[..., 0] + at.gradient
     parts = [element.part for element in conditional.elements if element.free]
     first = parts[-1].stop if parts else 0

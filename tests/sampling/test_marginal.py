@@ -87,6 +87,29 @@ def test_the_draw_kept_follows_the_conditional_posterior():
     assert abs(weights @ times - mean) < 4 * sd / np.sqrt(worth)
 
 
+def test_information_that_rounding_left_indefinite_gives_draws_of_the_rest(rng):
+    """Of one plant of a batch, as where one of its terms is nearly all of it; the others stay as they are."""
+    posterior = problem(
+        record(camera=1.0),
+        terms=2,
+        priors={"time_1": TIMES["time_1"], "time_2": TIMES["time_2"], "sigma": 1.0},
+    ).posterior
+    conditional = Conditional(posterior)
+    values = posterior.table.draw(4, rng)
+    at = conditional.expanded(values)
+    own, both = np.diagonal(at.information, axis1=1, axis2=2), conditional.elements[0].part
+    information = at.information.copy()
+    information[0, both, both] = (
+        1e10 * np.array([[1.0, 1.03], [1.03, 1.0]]) * np.sqrt(np.outer(own[0], own[0]))
+    )
+    draws = [
+        kept(conditional, e, 64, np.random.default_rng(1)) for e in (at, at._replace(information=information))
+    ]
+    assert draws[1].efficiency[0] > 0.0
+    for one, other in zip(*draws, strict=True):
+        assert np.array_equal(one[1:], other[1:])
+
+
 def test_a_proposal_of_orders_from_their_prior_has_their_density(rng):
     posterior = problem(record(camera=1.0), terms=2).posterior
     searched = Outer(posterior)
