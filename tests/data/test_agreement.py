@@ -18,6 +18,7 @@ from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.verbs.check import check
 
@@ -84,6 +85,26 @@ def test_two_plants_are_a_contradiction_and_chance_is_not() -> None:
     assert not one.gross
     assert abs(np.log(one.ratio)) == pytest.approx(np.log(1.3), abs=0.02)
     assert not disagreements((on, scaled(half, 1.04)))  # below what counts
+
+
+def test_another_gain_of_a_plant_that_oscillates_is_a_contradiction() -> None:
+    """Its description must miss far less than the difference, of which noise is a hundredth."""
+    device = replace(ONE, paths=((TransferPath(0.13, 2.8, (2.5, 1.0), (1.7, 0.9), 1.0),),))
+    on, off, half = (
+        record(
+            number,
+            device=device,
+            duration=25.0,
+            noise_sd=3e-4,
+            name=name,
+            command=step(to, at=2.0, rest=rest),
+        )
+        for number, (name, rest, to) in enumerate((("on", 0.0, 1.5), ("off", 1.5, 0.0), ("half", 0.0, 0.8)))
+    )
+    assert disagreements((on, off, half)) == ()
+    (one,) = disagreements((scaled(on, 1.3), off, half))
+    assert one.records[0] == "on"
+    assert one.ratio == pytest.approx(1.3, abs=0.03)
 
 
 def test_the_standard_error_of_a_ratio_is_its_scatter() -> None:
