@@ -17,6 +17,7 @@ from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import obstacles
@@ -54,6 +55,8 @@ if TYPE_CHECKING:
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
+_CONTRARY = 30.0
+"""Time for draws where records contradict each other grossly, which make no number usable [s]."""
 
 
 @final
@@ -307,8 +310,12 @@ def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Opt
 
 
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
-    """The sampling plan of a study."""
+    """The sampling plan of a study; with little time for records that no plant follows, unless it states
+    any."""
     wanted, study = problem.study.sampler, problem.study
+    seconds = wanted.seconds
+    if seconds is None and any(one.gross for one in disagreements((*study.fit, *study.held_out))):
+        seconds = _CONTRARY
     plan = SamplePlan.of(
         problem.posterior.dimension,
         seed=study.seed,
@@ -317,7 +324,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
-        seconds=wanted.seconds,
+        seconds=seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

@@ -173,7 +173,8 @@ def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:
     """`grade`, or the lowest level of the limitations where that is lower.
 
     The reason names each limitation, the most severe first, then the remedies; the reason of the sampling
-    comes first where it is as low, else last.
+    comes first where it is as low, else last. What makes numbers unusable however well they are sampled comes
+    before that: records that contradict each other are hard to sample too.
     """
     if not limitations:
         return grade
@@ -182,7 +183,7 @@ def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:
         limitation.remedy for limitation in ordered if limitation.remedy
     )  # a remedy of several limitations is given once
     reasons = "; ".join([*(limitation.reason for limitation in ordered), *remedies])
-    if _RANK[grade.level] >= _RANK[ordered[0].level]:
+    if _RANK[grade.level] >= _RANK[ordered[0].level] and ordered[0].level != "unusable":
         joint = "but " if grade.level == "reliable" else "also, "
         return Grade(grade.level, f"{grade.reason}; {joint}{reasons}")
     return Grade(ordered[0].level, f"{reasons}; the sampling by itself is {grade.level}: {grade.reason}")

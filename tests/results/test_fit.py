@@ -160,6 +160,17 @@ def test_a_quick_fit_takes_a_quarter_of_the_steps():
     assert (plan_of(problem, quick=False).steps, plan_of(problem, quick=True).steps) == (300, 75)
 
 
+def test_records_that_no_plant_follows_are_sampled_for_half_a_minute():
+    """Unless the study says for how long: their numbers are not usable, however long that takes."""
+    on = record(1, name="on")
+    wrong = replace(on, response=on.response * 1e3, name="wrong")
+    agreeing, contrary = study(on, record(2, name="again")), study(on, wrong)
+    assert plan_of(problem_of(agreeing), quick=False).seconds is None
+    assert plan_of(problem_of(contrary), quick=False).seconds == 30.0
+    stated = study(on, wrong, sampler={"seconds": 900.0})
+    assert plan_of(problem_of(stated), quick=False).seconds == 900.0
+
+
 def test_too_few_samples_and_nothing_to_sample_are_refused():
     few = record(camera=3.0)
     with pytest.raises(InputError, match="4 samples cannot determine 6 free parameters"):

@@ -155,7 +155,10 @@ def test_the_grade_is_the_worst_of_the_sampling_and_every_limitation_and_names_a
     assert both.level == "unusable"
     for words in ("the ensembles", "intervals hold only if A; do A", "intervals hold only if B"):
         assert words in both.reason
-    assert both.reason.index("only if B") < both.reason.index("only if A")
+    # what no sampling mends comes first
+    assert both.reason.index("only if B") < min(map(both.reason.index, ("only if A", "the ensembles")))
+    alone = limited(before, [first])
+    assert (alone.reason.index("the ensembles") < alone.reason.index("only if A")) is (sampled != "reliable")
 
 
 def test_a_limitation_that_names_parameters_leaves_the_others():
