@@ -200,6 +200,23 @@ def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):
         explained_draws(study(1), lambda draws, noise: True, quick=True)
 
 
+def test_many_samples_are_not_searched_and_have_one_proposal(monkeypatch):
+    """A search of 10 700 took five minutes, where a loop is to take one, and found nothing in one of two."""
+    asked: list[int | None] = []
+
+    def around(*given, attempts: int | None = None, **how) -> None:
+        asked.append(attempts)
+
+    monkeypatch.setattr(explained, "weighted_run", around)
+    monkeypatch.setattr(explained, "by_search", lambda *given, **how: None)
+    size = problem_of(study(1)).posterior.size
+    for most, expected in ((size - 1, [1]), (size, [1, None])):
+        asked.clear()
+        monkeypatch.setattr(explained, "_SEARCHED", most)
+        assert explained_draws(study(1), lambda draws, noise: True, quick=True) is None
+        assert asked == expected
+
+
 def test_a_clean_loop_leaves_the_study_as_it_was(bent: Loop):
     made = explained_study(bent.problem.study, bent.before.state.model)
     assert made.effects == bent.problem.study.effects
