@@ -32,8 +32,8 @@ from lcopa_bayes.sampling.weightedrun import weighted_run
 _DRAWS, _STREAM = 100, 13
 """Normal draws about an optimum [-], and the mark of their randomness."""
 _SEARCHED = 6_000
-"""Most samples of a plant that is searched [-]: of 10 700 a search takes five minutes of one processor, and
-ends without draws in one case of two."""
+"""Most samples of a plant that is searched [-]: of 10 700 of two axes a search took seven minutes of one
+processor, and ended without draws of the second axis."""
 
 
 def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | None = None) -> Study:
