@@ -201,7 +201,7 @@ def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):
 
 
 def test_many_samples_are_not_searched_and_have_one_proposal(monkeypatch):
-    """A search of 10 700 took seven minutes, where a loop is to take one, and gave draws of one axis of two."""
+    """A search of 10 700 took seven minutes, a loop is to take one, and gave draws of one axis of two."""
     asked: list[int | None] = []
 
     def around(*given, attempts: int | None = None, **how) -> None:
