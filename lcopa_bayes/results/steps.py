@@ -40,6 +40,8 @@ _LATER_POINTS = 800
 """Samples of the response after the record."""
 _SETTLED = 0.02
 """A response within this share of its steady value counts as settled [-]."""
+_ROUNDING = 1e-6
+"""Excess over its steady value that the calculated response of a plant without overshoot may have [-]."""
 _HALF = 0.5
 """Share of the draws from which an element counts as too fast for the sampling [-]."""
 
@@ -273,7 +275,8 @@ def figures_of(
         add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
         add(f"settling_2[{path}]", time_unit, settled, note)
         add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
-        add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
+        beyond = whole.max(axis=1) - 1.0
+        add(f"overshoot[{path}]", "-", np.where(beyond > _ROUNDING, beyond, 0.0))
         add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
         add(f"steady_state[{path}]", unit, gain, note)
     out.extend(_crosstalk(layout, curves))
