@@ -220,18 +220,18 @@ def _based(
 ) -> Base:
     """A study's base fit as stated; `key` separates its random numbers from others'. It starts from the
     optimum of a `contained` model too, and `again` from more starts where its residual stands out."""
-    problem = problem_of(study)
-    fit = _fit(problem, key, contained, again, crew)
+    problem, seed = problem_of(study), (study.seed, 10, *key)
+    fit = _fit(problem, seed, contained, again, crew)
     narrow = narrowed(problem, partial(_shift, fit))
     if narrow is not problem:
         problem, near = narrow, [fit.optimum.x]  # of the same mode, or of one beside it
-        rng, model = np.random.default_rng([study.seed, 10, *key]), ExtendedModel(narrow.posterior)
-        fit = base_fit(model, rng, starts=1, near=near, crew=crew)
+        model = ExtendedModel(narrow.posterior)
+        fit = base_fit(model, np.random.default_rng(seed), starts=1, near=near, crew=crew)
     return Base(problem, fit, _state(study, fit), "")
 
 
-def _fit(problem: Problem, key: Sequence[int], contained: Base | None, again: bool, crew: Crew) -> BaseFit:
-    model, seed = ExtendedModel(problem.posterior), [problem.study.seed, 10, *key]
+def _fit(problem: Problem, seed: Sequence[int], contained: Base | None, again: bool, crew: Crew) -> BaseFit:
+    model = ExtendedModel(problem.posterior)
     if contained is not None:
         near = _lifted(model, contained, np.random.default_rng([*seed, 1]))
     else:
