@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +16,7 @@ import pandas as pd
 from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import in_time_unit
+from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
 from lcopa_bayes.data.settings import (
     CandidateSettings,
@@ -154,6 +156,11 @@ class Study:
     def response_axes(self) -> tuple[Axis, ...]:
         """Axes of the response of every record."""
         return self.fit[0].response_axes
+
+    @cached_property
+    def disagreements(self) -> tuple[Disagreement, ...]:
+        """What its records contradict, those held out too; calculated once."""
+        return disagreements((*self.fit, *self.held_out))
 
     def with_seed(self, seed: int) -> Study:
         """The same study with another seed."""

@@ -141,7 +141,8 @@ def _sampled(
 ) -> tuple[Run, Draws] | None:
     """Importance draws around optima. Of a plant without effects those of a search, where a first proposal
     around the optima is not close to the posterior: it costs as much as three such proposals, and fails less
-    often. Under noise that is not Gaussian gains and offsets are searched too, which takes minutes."""
+    often. It takes minutes, and is left to a fit, of many samples and under noise that is not Gaussian, where
+    gains and offsets are searched too."""
     posterior, plan = problem.posterior, plan_of(problem, quick=False)
     around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima)
     plain = posterior.simulation is None and isinstance(posterior.noise, GaussianNoise)

@@ -23,7 +23,6 @@ import numpy as np
 from scipy.stats import binom
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
@@ -229,7 +228,7 @@ def limitations(
 
 def _disagreeing(study: Study) -> Iterator[Limitation]:
     """Records that one plant cannot follow."""
-    for one in disagreements((*study.fit, *study.held_out)):
+    for one in study.disagreements:
         yield Limitation("unusable" if one.gross else "tentative", one.reason, one.remedy)
 
 

@@ -19,7 +19,6 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
-from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import obstacles
@@ -108,7 +107,7 @@ class FirstLook:
     def verdict(self) -> str:
         """How well the best optimum follows the records, and what the numbers rest on."""
         study = self.problem.study
-        parts = [one.sentence for one in disagreements((*study.fit, *study.held_out))]
+        parts = [one.sentence for one in study.disagreements]
         for held, name in ((False, "Fitted"), (True, "Held out")):
             shown = [band for band in self.bands if band.held_out == held]
             if shown:

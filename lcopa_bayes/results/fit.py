@@ -17,7 +17,6 @@ from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.core.parallel import meanwhile
-from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import obstacles
@@ -314,7 +313,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
     any."""
     wanted, study = problem.study.sampler, problem.study
     seconds = wanted.seconds
-    if seconds is None and any(one.gross for one in disagreements((*study.fit, *study.held_out))):
+    if seconds is None and any(one.gross for one in study.disagreements):
         seconds = _CONTRARY
     plan = SamplePlan.of(
         problem.posterior.dimension,

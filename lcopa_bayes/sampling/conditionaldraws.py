@@ -60,8 +60,9 @@ class _Block(NamedTuple):
 def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Generator) -> Kept:
     """One of `tries` draws for each expansion."""
     posterior, batch = conditional.posterior, len(at.values)
-    at = _definite(conditional, at)
-    x, log_source, exists = _drawn(conditional, at, tries, rng)
+    limits = 1.0 / _widths(conditional, at) ** 2
+    at = _definite(at, limits)
+    x, log_source, exists = _drawn(conditional, at, limits, tries, rng)
     flat = x.reshape(batch * tries, -1)
     values, possible = conditional.values(flat, np.repeat(at.values, tries, axis=0))
     usable = np.flatnonzero(exists.ravel() & possible)
@@ -92,17 +93,16 @@ def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Gene
     )
 
 
-def _definite(conditional: Conditional, at: Expanded) -> Expanded:
-    """Expansions whose information, with that of the widths, is positive definite.
+def _definite(at: Expanded, limits: Matrix) -> Expanded:
+    """Expansions whose information, with that of the `limits`, (batch, size), is positive definite.
 
     Where one term is nearly all of D(s_0), changes of its time and of the gain cancel but for a part in 1e8
     or less, and rounding is more than what is left: it is as large as the most negative curvature shows, in
     coordinates of information 1, and curvature below that is not known.
     """
-    prior = 1.0 / _widths(conditional, at) ** 2
-    own = np.maximum(np.diagonal(at.information, axis1=1, axis2=2), 0.0) + prior
+    own = np.maximum(np.diagonal(at.information, axis1=1, axis2=2), 0.0) + limits
     eye, sd = np.eye(at.x.shape[1]), 1.0 / np.sqrt(own)
-    scaled = (at.information + eye * prior[:, None, :]) * sd[:, :, None] * sd[:, None, :]
+    scaled = (at.information + eye * limits[:, None, :]) * sd[:, :, None] * sd[:, None, :]
     rounding = np.full(len(own), _ROUNDING)
     try:
         np.linalg.cholesky(scaled + _ROUNDING * eye)
@@ -120,10 +120,9 @@ def in_domain(posterior: Posterior, columns: Sequence[int], values: Matrix) -> F
     return out
 
 
-def _blocks(conditional: Conditional, at: Expanded) -> list[_Block]:
-    """Gaussians of each element's shares in turn, then of the rest."""
-    wide = _widths(conditional, at)
-    precision = at.information + np.eye(at.x.shape[1]) / wide[:, None, :] ** 2
+def _blocks(conditional: Conditional, at: Expanded, limits: Matrix) -> list[_Block]:
+    """Gaussians of each element's shares in turn, then of the rest, no wider than the `limits`."""
+    precision = at.information + np.eye(at.x.shape[1]) * limits[:, None, :]
     pull = (precision @ at.x[..., None])[..., 0] + at.gradient
     parts = [element.part for element in conditional.elements if element.free]
     first = parts[-1].stop if parts else 0
@@ -151,7 +150,7 @@ def _widths(conditional: Conditional, at: Expanded) -> Matrix:
 
 
 def _drawn(
-    conditional: Conditional, at: Expanded, tries: int, rng: np.random.Generator
+    conditional: Conditional, at: Expanded, limits: Matrix, tries: int, rng: np.random.Generator
 ) -> tuple[Array, Matrix, Flags]:
     """Coordinates (batch, tries, size), log density in the sampled coordinates, and existence."""
     batch, size = at.x.shape
@@ -163,7 +162,7 @@ def _drawn(
     for e, element in enumerate(conditional.elements):
         if not element.free:
             levels[e] = (1 / conditional.rest(element, at.values))[:, None]
-    for block in _blocks(conditional, at):
+    for block in _blocks(conditional, at, limits):
         pull = block.pull[:, None] - x[..., : block.part.start] @ block.cross.swapaxes(1, 2)
         if block.part.start in elements:
             element = elements[block.part.start]

@@ -17,7 +17,6 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import csv_of
 from lcopa_bayes.core.units import measured
-from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
@@ -52,7 +51,7 @@ def inventory(study: Study) -> dict[str, Any]:
     InputError where its settings do not fit its records.
     """
     problem, problems = problem_of(with_least_terms(study)), obstacles(study)
-    contradicted = disagreements((*study.fit, *study.held_out))
+    contradicted = study.disagreements
     disagree = [str(one) for one in contradicted]
     rows = problem.posterior.table.rows
     sentences = [*_of_plant(problem), *_of_model(problem)]

@@ -10,7 +10,6 @@ from typing import Any, final
 import pandas as pd
 
 from lcopa_bayes.core.errors import gathered, refuse_if
-from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.averaging import averaged
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.conversion import Mapped, convert
@@ -137,7 +136,7 @@ def new(
     if average != 1:
         means = averaged(study, average)
         study, notes = means, [*notes, *_losses(study, average)]
-    warnings = unmet(study) or map(str, disagreements((*study.fit, *study.held_out)))
+    warnings = unmet(study) or map(str, study.disagreements)
     result = NewStudy(study, tuple(notes), tuple(warnings))
     result.save(folder, overwrite=overwrite)
     return result
