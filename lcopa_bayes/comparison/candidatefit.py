@@ -32,7 +32,7 @@ from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.results.alternatives import alternatives_of
 from lcopa_bayes.results.bands import POINTWISE
 from lcopa_bayes.results.discretisation import optima_of
-from lcopa_bayes.results.fit import Fit, fit, plan_of, whole
+from lcopa_bayes.results.fit import Fit, budget_of, fit, plan_of, whole
 from lcopa_bayes.results.runfolder import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
 from lcopa_bayes.sampling.convergence import Grade, Limitation
@@ -100,6 +100,9 @@ CARD = "candidate.json"
 WALKERS = 32
 """Walkers of a comparison where the study leaves their number open, if the dimension does not ask for more
 [-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
+BUDGET = 240.0
+"""Time for the draws of a candidate, where the study states none [s]. Ensembles of a lightly damped plant of
+four paths took 500 s each of its candidates, twice, and none was usable."""
 _STARTS = 64
 """Draws kept as starts of richer models [-]."""
 _VERSION = 5
@@ -241,11 +244,14 @@ def laplace(problem: Problem) -> float:
 
 
 def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
-    """A candidate with fewer walkers than a fit has; what the study's ``[sampler]`` states is kept.
+    """A candidate with fewer walkers than a fit has and a budget of time (`BUDGET`); what the study's
+    ``[sampler]`` states is kept.
 
-    Where the short plan leaves a posterior that is unusable it is sampled again as a fit would.
+    Where the short plan leaves a posterior that is unusable, before its budget ends, it is sampled again as a
+    fit would.
     """
-    study, own = candidate.study, candidate.study.sampler
+    study = candidate.study
+    own = replace(study.sampler, seconds=budget_of(study) or BUDGET)
     sampler = replace(own, walkers=own.walkers or WALKERS)
     # the study file may name candidates that say nothing of this one
     return Contender(

@@ -308,13 +308,16 @@ def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Opt
     return resolved_optima(problem, optima_of(problem, starts=QUICK_STARTS if quick else STARTS))
 
 
+def budget_of(study: Study) -> float | None:
+    """Time for draws that a study states, or little for records that no plant follows [s]; None for any."""
+    if study.sampler.seconds is None and any(one.gross for one in study.disagreements):
+        return _CONTRARY
+    return study.sampler.seconds
+
+
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
-    """The sampling plan of a study; with little time for records that no plant follows, unless it states
-    any."""
+    """The sampling plan of a study."""
     wanted, study = problem.study.sampler, problem.study
-    seconds = wanted.seconds
-    if seconds is None and any(one.gross for one in study.disagreements):
-        seconds = _CONTRARY
     plan = SamplePlan.of(
         problem.posterior.dimension,
         seed=study.seed,
@@ -323,7 +326,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
-        seconds=seconds,
+        seconds=budget_of(study),
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

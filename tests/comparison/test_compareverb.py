@@ -13,7 +13,7 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.comparison.candidatefit import contender
+from lcopa_bayes.comparison.candidatefit import BUDGET, contender
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.errors import InputError
@@ -232,6 +232,13 @@ def test_a_comparison_samples_as_a_fit_does():
         own, compared = (plan_of(problem_of(each.study), quick=False) for each in (one, made))
         assert (compared.ensembles, compared.target_ess) == (own.ensembles, own.target_ess)
         assert compared.steps == own.steps
+
+
+@pytest.mark.parametrize(("sampler", "budget"), [({}, BUDGET), ({"seconds": 7.0}, 7.0)])
+def test_candidates_have_a_budget_of_time_that_a_study_may_state(sampler, budget):
+    (one, *_) = candidates_of(study(record(), sampler=sampler), pick=PICK)
+    made = contender(one, None, quick=False, resume=False)
+    assert (made.candidate.study.sampler.seconds, made.patient.seconds) == (budget, budget)
 
 
 # -- measured records ------------------------------------------------------------------------------
