@@ -19,6 +19,7 @@ from lcopa_bayes.data.settings import (
 )
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.priors import Prior
@@ -71,6 +72,22 @@ def record(
     bench = Bench(camera=camera, noise_sd=noise_sd, noise_correlation=correlation)
     rng = np.random.default_rng(seed)
     return simulate(device, bench, command, duration=duration, name=name, rng=rng)
+
+
+def ringing(time: float, order: float, delay: float, *, seed: int) -> tuple[Record, Vector]:
+    """300 samples, one per ms, of a plant of gain 1 whose drive is 1 or -1 from sample to sample, with noise
+    of 0.05, and the table values it was made with, by blocks 32 times narrower than those of its study."""
+    rng = np.random.default_rng(seed)
+    drive = rng.choice([-1.0, 1.0], 300)
+    drive[:4] = 0.0
+    silent = Record("ringing", np.arange(300.0), drive[:, None], np.zeros((300, 1)), (U,), (Y,), "ms")
+    fine = problem_of(study(silent, noise="white")).refined(32).posterior
+    known = {"gain": 1.0, "time": time, "order": order, "delay": delay, "offset": 0.0, "sigma": 0.05}
+    values = np.array([known[row.kind] for row in fine.table.rows])
+    least = LeastSquares(fine)
+    exact = known["sigma"] * least.misfit(least.coordinates(values), values)[:300]
+    seen = exact + known["sigma"] * rng.standard_normal(300)
+    return replace(silent, response=seen[:, None]), values
 
 
 def study(

@@ -14,6 +14,7 @@ from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.crew import ALONE
 from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.effectstarts import effect_starts
+from lcopa_bayes.inference.halfperiods import half_a_period_away
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.pathstarts import beside_each_other
@@ -48,6 +49,8 @@ _FIRST, _FURTHER, _FINE = 1.5, 1.5, 1e-3
 from the ends of its prior, and sd [-]."""
 _SHORTER, _LEAST_FIRST = 0.25, 0.1
 """Factor on a first step that leads too far down, and least of it that is tried [-]."""
+_SWINGS = 4
+"""Half periods by which delays of a plant that rings are moved, at most [-]."""
 _SECTION, _WITHIN = (15, 1e-4), 10.0
 """Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
 """
@@ -111,7 +114,23 @@ def find_optima(
     if spare:
         found = _kept(posterior, [*found, *_descended(posterior, spare, crew=crew)])
         found = _recombined(posterior, found)
-    return _to_its_digits(posterior, found)
+    return _to_its_digits(posterior, _beside_half_periods(posterior, found, crew))
+
+
+def _beside_half_periods(
+    posterior: Posterior, found: tuple[Optimum, ...], crew: Workers[Posterior]
+) -> tuple[Optimum, ...]:
+    """Optima with those half a period from the best, as long as one of these is better."""
+    for _ in range(_SWINGS if found else 0):
+        beside = half_a_period_away(posterior, found[0].values)
+        if not beside:
+            break
+        best = found[0].log_density
+        found = _kept(posterior, [*found, *_descended(posterior, beside, crew=crew)])
+        if found[0].log_density <= best:
+            break
+        found = _recombined(posterior, found)
+    return found
 
 
 def _screened(crew: Workers[Posterior], values: Matrix) -> Matrix:

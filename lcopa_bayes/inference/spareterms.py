@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
@@ -41,8 +43,13 @@ def beside_spare_terms(posterior: Posterior, near: Matrix) -> list[Vector]:
                 values[orders[:-1]], values[times[:-1]] = best[orders][kept], best[times][kept]
                 values[last], values[times[-1]] = low + _BARELY, best[times[omitted]]
                 starts.append(values)
-        inside = [
-            np.isfinite(posterior.log_density(posterior.coordinates(one[None]))).all() for one in starts
-        ]
-        out += [one for one, possible in zip(starts, inside, strict=True) if possible]
+        out += possible(posterior, starts)
     return out
+
+
+def possible(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
+    """Those of some table values, (rows,) each, that have a density."""
+    if not starts:
+        return []
+    density = posterior.log_density(posterior.coordinates(np.array(starts)))
+    return [one for one, level in zip(starts, density, strict=True) if np.isfinite(level)]
