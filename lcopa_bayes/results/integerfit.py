@@ -90,12 +90,13 @@ def integer_fit(
     quiet: bool = True,
 ) -> IntegerFit | None:
     """The plant of a fit with integer orders of all elements that the records let have them, sampled as that
-    was; None without any, or where its plant has effects.
+    was; None without any, where the plant has effects, or where its own draws are unusable: beside these no
+    others mean anything.
 
     With `folder`, the run folder of the fit, `resume` goes on from what was sampled in its `integer`.
     """
     posterior = fitted.problem.posterior
-    if posterior.simulation is not None:
+    if posterior.simulation is not None or fitted.draws.sampling_grade.level == "unusable":
         return None
     level, values = _optimum(posterior, [fitted.best])
     orders = dict(nearest(posterior.table, values))

@@ -4,6 +4,7 @@ let them be, and none where a fractional order shows."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,13 @@ def test_integer_orders_hold_what_free_ones_put_at_an_end() -> None:
 
 def test_a_fractional_order_leaves_no_integer_one() -> None:
     assert integer_fit(fitted(HALF, 1, noise=WHITE)) is None
+
+
+def test_beside_unusable_draws_none_are_sampled(over: Fit) -> None:
+    first, *rest = over.draws.qualities
+    scarce = replace(over.draws, qualities=(replace(first, ess_bulk=3.0), *rest))
+    assert scarce.sampling_grade.level == "unusable"
+    assert integer_fit(replace(over, draws=scarce), quick=True) is None
 
 
 def test_a_killed_run_goes_on_from_what_was_sampled(
