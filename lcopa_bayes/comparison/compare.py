@@ -165,8 +165,9 @@ def compare(
     (`candidatefit.REJECTED`). A candidate that contains another is held against it, and sampled again where
     it has missed a mode that the smaller one has found (`containment`).
 
-    Candidates are fitted in `jobs` processes; what they give is the same. With `folder` each has a folder
-    of its own under `candidates/`, and `resume` goes on from what is there. InputError for fewer than two
+    Candidates are fitted in `jobs` processes; what they give is the same, unless a budget of time ends one
+    (`candidatefit.BUDGET`). With `folder` each has a folder of its own under `candidates/`, and `resume` goes
+    on from what is there. InputError for fewer than two
     candidates, for candidates of different records, and when a candidate does not fit its records; then
     nothing is fitted.
     """

@@ -23,14 +23,18 @@ def half_a_period_away(posterior: Posterior, values: Vector) -> list[Vector]:
     (T s)^order`` with an order near 2 has a period of ``2 pi T``.
     """
     table, layout, out = posterior.table, posterior.table.layout, list[Vector]()
-    for path in layout.paths:
-        row = table.at("delay", layout.delay_of[path.response][path.drive])
-        times, orders = table.terms[layout.element_of[path.response][path.drive]]
-        for time, order in zip(times, orders, strict=True) if row in posterior.sampled else ():
-            half = np.pi * values[time] if values[order] > _RINGING else 0.0
-            for delay in {values[row] - half, values[row] + half} - {values[row]}:
-                if delay > -0.5 * half:
+    slots = {(unit.delay, unit.element) for unit in layout.units}
+    for delay, element in sorted(slots):
+        row = table.at("delay", delay)
+        if row not in posterior.sampled:
+            continue
+        for time, order in zip(*table.terms[element], strict=True):
+            if values[order] <= _RINGING:
+                continue
+            half = np.pi * values[time]
+            for moved in (values[row] - half, values[row] + half):
+                if moved > -0.5 * half:
                     start = values.copy()
-                    start[row] = max(delay, _LEAST * half)
+                    start[row] = max(moved, _LEAST * half)
                     out.append(start)
     return possible(posterior, out)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small import ringing, study
+from small import TWO, record, ringing, study
 
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.halfperiods import half_a_period_away
@@ -34,6 +34,16 @@ def test_a_delay_is_moved_by_half_a_period_of_what_rings(order, delay):
         assert delays == pytest.approx([delay + half])
     for one in moved:
         np.testing.assert_array_equal(np.delete(one, row), np.delete(values, row))
+
+
+def test_what_paths_share_is_moved_once():
+    shared = problem_of(study(record(device=TWO))).posterior
+    table, values = shared.table, shared.table.draw(1, np.random.default_rng(3))[0]
+    row, (first, *_) = table.at("delay", 0), table.terms[0].orders
+    values[row], values[[k for terms in table.terms for k in terms.orders]] = 1.7, 0.5
+    values[first], values[table.terms[0].times[0]] = 1.9, 0.4
+    delays = sorted(one[row] for one in half_a_period_away(shared, values))
+    assert delays == pytest.approx([1.7 - 0.4 * np.pi, 1.7 + 0.4 * np.pi])
 
 
 @pytest.mark.parametrize(("time", "order", "delay", "seed"), [(0.35, 1.97, 0.3, 2), (0.4, 1.95, 0.1, 5)])
