@@ -117,17 +117,21 @@ class Loop:
         """How far the numbers can be trusted: as far as verdict and model, and without draws no further
         than a Laplace approximation."""
         if self.draws is not None:
-            limit = ""
-            if self.verdict.confidence == "tentative":
-                limit = "the verdict that they rest on is tentative"
-            elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
-                limit = "the records hold something that the model they are of does not explain"
-            if limit and self.draws.grade.level == "reliable":
-                return Grade("tentative", f"the draws are reliable, but {limit}")
+            if self._limit and self.draws.grade.level == "reliable":
+                return Grade("tentative", f"the draws are reliable, but {self._limit}")
             return self.draws.grade
         return Grade(
             "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
         )
+
+    @property
+    def _limit(self) -> str:
+        """Why no number is reliable, however well it was sampled; empty where it may be."""
+        if self.verdict.confidence == "tentative":
+            return "the verdict that they rest on is tentative"
+        if self.verdict.leaves and all(one.support == "plant" for one in self.lags):
+            return "the records hold something that the model they are of does not explain"
+        return ""
 
     def estimate(self, k: int) -> dict[str, Any]:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
@@ -139,7 +143,8 @@ class Loop:
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
         ess = ess_with_lags(own.ess, self.lags)
-        return here.as_json(ess=ess, grade=own.grade, interval=own.interval) | {"alone": alone}
+        grade = "tentative" if self._limit and own.grade == "reliable" else own.grade
+        return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""

@@ -24,6 +24,7 @@ from lcopa_bayes.effectsearch.explained import (
     explained_study,
 )
 from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -58,6 +59,16 @@ def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, 
         error = sd * np.sqrt(1 / there.ess + 1 / own["ess"]) * np.array([2.11, 1.25, 2.11])
         apart = np.array(own["alone"]) - [there.lower, there.value, there.upper]
         assert (np.abs(apart) < 4 * error).all(), own["name"]
+
+
+def test_numbers_are_no_more_reliable_than_the_verdict_they_rest_on(bent: Loop):
+    assert bent.draws is not None
+    well = replace(bent, draws=replace(bent.draws, target_ess=50.0, limitations=()))
+    for confidence, level in (("firm", "reliable"), ("tentative", "tentative")):
+        said = replace(well, verdict=replace(well.verdict, confidence=confidence))
+        numbers = results(said)
+        grades = {one["grade"] for one in (*numbers["parameters"], *numbers["figures"])}
+        assert (numbers["grade"], grades) == (level, {level})
 
 
 def test_draws_are_spared_where_normal_ones_about_the_optimum_are_of_no_use(bent: Loop, monkeypatch):
