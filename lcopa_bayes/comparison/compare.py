@@ -167,9 +167,8 @@ def compare(
 
     Candidates are fitted in `jobs` processes; what they give is the same, unless a budget of time ends one
     (`candidatefit.BUDGET`). With `folder` each has a folder of its own under `candidates/`, and `resume` goes
-    on from what is there. InputError for fewer than two
-    candidates, for candidates of different records, and when a candidate does not fit its records; then
-    nothing is fitted.
+    on from what is there. InputError for fewer than two candidates, for candidates of different records, and
+    when a candidate does not fit its records; then nothing is fitted.
     """
     problems = _problems(candidates)
     refuse_if(problems)
