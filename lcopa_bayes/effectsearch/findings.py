@@ -10,6 +10,7 @@ import numpy as np
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.explained import coordinates_of
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.outliers import Outlying, without_outliers
 from lcopa_bayes.effectsearch.rounds import Search
@@ -19,7 +20,6 @@ from lcopa_bayes.effectsearch.scores import (
     apart,
     fit_scores,
     held_out_scores,
-    left_out_scores,
     over_noise,
     risen,
 )

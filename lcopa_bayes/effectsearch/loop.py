@@ -45,9 +45,7 @@ from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
-from lcopa_bayes.effectsearch.scores import (
-    State,
-)
+from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import (
     Verdict,

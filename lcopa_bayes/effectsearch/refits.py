@@ -15,10 +15,11 @@ from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.freedconstants import freed
+from lcopa_bayes.effectsearch.leavingout import groups, log_scores
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.priorwidth import widened, with_room
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
-from lcopa_bayes.effectsearch.scores import State, groups, log_scores
+from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed

@@ -165,8 +165,7 @@ class Regression:
         white, jacobian = both[0], np.ascontiguousarray(both[1:].T)
         low, high = self.model.bounds
         spread, cost = self.model.spread, self._cost(x, white)
-        mean, precision = self._prior
-        slope = jacobian.T @ white - precision * (x - mean)
+        slope = self._slope(x, white, jacobian)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
         ends = self.model.bounds_about(x)
         near = np.minimum(x - low, high - x) < _AT_END * np.where(np.isfinite(high - low), high - low, 0.0)
@@ -191,6 +190,14 @@ class Regression:
             self.whitening.effective,
             stuck,
         )
+
+    def _slope(self, x: Vector, white: Vector, jacobian: Matrix) -> Vector:
+        mean, precision = self._prior
+        return np.asarray(jacobian.T @ white - precision * (x - mean))
+
+    def gradient(self, at: Optimum) -> Vector:
+        """Of the log density at a described point, (k,) [nat / coordinate]."""
+        return self._slope(at.x, at.white, at.jacobian)
 
     def lowest(
         self, starts: Sequence[Vector], *, gain: float = GAIN, enough: float = -np.inf, crew: Crew = ALONE

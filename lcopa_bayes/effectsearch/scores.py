@@ -1,10 +1,4 @@
-"""Errors of a model on records it was fitted to and on records it never saw, per axis and record.
-
-What a fit says of samples it is not shown: each record, or each fifth of a single one, left out in turn, in
-closed form of the linearised model. With whitened residual r and tangents J at the optimum, information
-``H = J' J + prior`` and group k, the optimum without the group is one Gauss-Newton step away,
-``x - (H - J_k' J_k)^-1 J_k' r_k``, and its predictive density follows without a refit.
-"""
+"""Errors of a model on records it was fitted to and on records it never saw, per axis and record."""
 
 from __future__ import annotations
 
@@ -14,14 +8,14 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import HALF_WIDTH, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Optimum
-from lcopa_bayes.effectsearch.whitening import Part, Whitening
+from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.noise import Noise, WhiteAR1
@@ -32,63 +26,10 @@ from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.prediction import axis_draws
 from lcopa_bayes.sampling.draws import Draws
 
-PARTS = 5
-"""Parts of a single record that are left out in turn [-]."""
-_STRETCHES = 10
-"""Stretches of successive samples in each part [-]."""
-
-
-def groups(whitening: Whitening) -> list[Index]:
-    """Positions in the stack: of each record; of a single one every fifth of 50 stretches of successive
-    samples, all axes alike.
-
-    One fifth in one piece would take away the only step of a record, and nothing predicts a step not seen.
-    """
-    records: dict[int, list[Index]] = {}
-    for part in whitening.parts:
-        records.setdefault(part.record, []).append(np.arange(part.rows.start, part.rows.stop))
-    if len(records) > 1:
-        return [np.concatenate(axes) for axes in records.values()]
-    (axes,) = records.values()
-    cut = [np.array_split(rows, PARTS * _STRETCHES) for rows in axes]
-    return [np.concatenate([stretch for each in cut for stretch in each[k::PARTS]]) for k in range(PARTS)]
-
-
-def in_turn(records: int) -> str:
-    """In words, what is left out of that many records."""
-    if records > 1:
-        return "leaving records out in turn"
-    return f"leaving each of {PARTS} parts of the only record out in turn"
-
-
-def log_scores(optimum: Optimum, chosen: Sequence[Index]) -> Vector:
-    """Log predictive density of each group given the others, without the constant of the noise [nat]."""
-    whole = np.linalg.slogdet(optimum.information)[1]
-    out = []
-    for rows in chosen:
-        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
-        rest = optimum.information - tangents.T @ tangents
-        pull = tangents.T @ residual
-        power = residual @ residual + pull @ np.linalg.solve(rest, pull)
-        out.append(-0.5 * power + 0.5 * (np.linalg.slogdet(rest)[1] - whole))
-    return np.array(out)
-
-
-def shifts(optimum: Optimum, chosen: Sequence[Index]) -> list[tuple[Vector, Matrix]]:
-    """For each group, how far the optimum moves when it is left out, and the covariance there."""
-    out = []
-    for rows in chosen:
-        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
-        covariance: Matrix = np.linalg.inv(optimum.information - tangents.T @ tangents).astype(float)
-        out.append((-covariance @ (tangents.T @ residual), covariance))
-    return out
-
-
 _DRAWS = 100
 """Draws about an optimum behind the prediction of a held-out record [-]."""
 _MOST = 400
 """The same of a sampled posterior, at most [-]."""
-_SEED = 15
 _TRIES = 4
 """Draws for each of them within the support [-]."""
 
@@ -184,37 +125,7 @@ def fit_scores(state: State) -> list[Score]:
     """On the records that were fitted."""
     tangents = state.optimum.tangents
     variance = np.einsum("nk,kl,nl->n", tangents, state.covariance, tangents, optimize=True)
-    return _scores(state, state.fitted, variance, "the fit", own_levels=False)
-
-
-def left_out_scores(state: State) -> list[Score]:
-    """On the fit records, each left out in turn (one Gauss-Newton step away from the fit of all)."""
-    chosen, several = groups(state.whitening), len(state.whitening.samples) > 1
-    mean, rng = state.fitted, np.random.default_rng(_SEED)
-    variance, draws = np.zeros_like(mean), np.zeros((_DRAWS if several else 0, mean.size))
-    for rows, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
-        tangents = state.optimum.tangents[rows]
-        mean[rows] += tangents @ shift
-        variance[rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
-        if several:
-            apart = rng.standard_normal((_DRAWS, len(shift))) @ root_of(covariance).T
-            draws[:, rows] = apart @ tangents.T
-    own = several and _own_levels(state)
-    scores = _scores(state, mean, variance, "the other records", own_levels=own)
-    if not several:  # parts of a record are beside what was fitted, and say nothing of another one
-        return scores
-    parts = zip(scores, state.whitening.parts, strict=True)
-    return [replace(one, draws=_of_part(state, part, draws[:, part.rows], own, rng)) for one, part in parts]
-
-
-def _of_part(state: State, part: Part, draws: Matrix, own: bool, rng: np.random.Generator) -> Matrix:
-    """Draws of a prediction, with `own` level about the level that would be taken from each."""
-    if own:
-        noise = state.whitening.weighed[part.axis]
-        known = [_level(part.samples, part.axis, draw, noise) for draw in draws]
-        levels = np.array([level + np.sqrt(doubt) * rng.standard_normal() for level, doubt, _ in known])
-        draws = draws - levels[:, None]
-    return np.asarray(draws - draws.mean(axis=0))
+    return scores_of(state, state.fitted, variance, "the fit", own_levels=False)
 
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:
@@ -275,13 +186,13 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     return Draws(held, values[None], np.zeros((1, len(values))), (), float(_DRAWS)), WhiteAR1()
 
 
-def _own_levels(state: State) -> bool:
+def own_levels_of(state: State) -> bool:
     """Whether every record has an offset of its own."""
     table = state.model.plant.table
     return any(row.kind == "offset" and row.place.second >= 0 for row in table.rows)
 
 
-def _scores(
+def scores_of(
     state: State, mean: Vector, variance: Vector, level_from: str, *, own_levels: bool
 ) -> list[Score]:
     """One score per record and axis; with `own_levels` each record's level is taken from its samples."""
@@ -290,7 +201,7 @@ def _scores(
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if own_levels:
             misfit, noise = part.observed.values - centre, state.whitening.weighed[part.axis]
-            level, doubt, source = _level(part.samples, part.axis, misfit, noise)
+            level, doubt, source = level_of(part.samples, part.axis, misfit, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         held_out = level_from != "the fit"
@@ -326,7 +237,7 @@ def _score(
     )
 
 
-def _level(record: Samples, axis: int, misfit: Vector, noise: Law) -> tuple[float, float, str]:
+def level_of(record: Samples, axis: int, misfit: Vector, noise: Law) -> tuple[float, float, str]:
     """Level of a record that is not known from the fit, its variance and where it comes from.
 
     By generalised least squares from the samples that a fit takes the offset of a held-out record from.

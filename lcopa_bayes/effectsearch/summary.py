@@ -10,10 +10,11 @@ import numpy as np
 from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
 from lcopa_bayes.effectsearch.findings import Side
 from lcopa_bayes.effectsearch.lags import ess_with_lags
+from lcopa_bayes.effectsearch.leavingout import in_turn
 from lcopa_bayes.effectsearch.loop import Loop
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
-from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse
+from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.model.effects.effect import Card
 from lcopa_bayes.results.sumsoflags import sentence_of

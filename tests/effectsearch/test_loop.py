@@ -19,11 +19,12 @@ from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.heldouteffects import unseen_share
+from lcopa_bayes.effectsearch.leavingout import log_scores
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import Round
-from lcopa_bayes.effectsearch.scores import log_scores, risen
+from lcopa_bayes.effectsearch.scores import risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import COVERED, Dynamics, Findings, Miss, decide
 from lcopa_bayes.effectsearch.whitening import Whitening

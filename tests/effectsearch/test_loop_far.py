@@ -20,9 +20,9 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.leavingout import PARTS, groups
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import Law, joint_noise
-from lcopa_bayes.effectsearch.scores import PARTS, groups
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
