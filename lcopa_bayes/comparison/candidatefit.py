@@ -32,7 +32,7 @@ from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.results.alternatives import alternatives_of
 from lcopa_bayes.results.bands import POINTWISE
 from lcopa_bayes.results.discretisation import optima_of
-from lcopa_bayes.results.fit import Fit, budget_of, fit, plan_of, whole
+from lcopa_bayes.results.fit import Fit, fit, plan_of, whole
 from lcopa_bayes.results.runfolder import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
 from lcopa_bayes.sampling.convergence import Grade, Limitation
@@ -243,15 +243,17 @@ def laplace(problem: Problem) -> float:
     return float(logsumexp(levels)) + problem.posterior.table.log_permutations if levels else -np.inf
 
 
-def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
-    """A candidate with fewer walkers than a fit has and a budget of time (`BUDGET`); what the study's
-    ``[sampler]`` states is kept.
+def contender(
+    candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool, budget: float = BUDGET
+) -> Contender:
+    """A candidate with fewer walkers than a fit has and a `budget` of time for its draws [s]; what the
+    study's ``[sampler]`` states is kept.
 
     Where the short plan leaves a posterior that is unusable, before its budget ends, it is sampled again as a
     fit would.
     """
     study = candidate.study
-    own = replace(study.sampler, seconds=budget_of(study) or BUDGET)
+    own = replace(study.sampler, seconds=study.sampler.seconds or budget)
     sampler = replace(own, walkers=own.walkers or WALKERS)
     # the study file may name candidates that say nothing of this one
     return Contender(

@@ -162,6 +162,11 @@ class Study:
         """What its records contradict, those held out too; calculated once."""
         return disagreements((*self.fit, *self.held_out))
 
+    @property
+    def contradictory(self) -> bool:
+        """Whether they contradict each other so grossly that no plant follows them."""
+        return any(one.gross for one in self.disagreements)
+
     def with_seed(self, seed: int) -> Study:
         """The same study with another seed."""
         return replace(self, seed=seed)

@@ -4,7 +4,7 @@ Of the linearised model this needs no refit. With whitened residual r and tangen
 information ``H = J' J + prior`` and group k, the optimum without the group is one Gauss-Newton step away,
 ``x - (H - J_k' J_k)^-1 J_k' r_k``. Tangents hold no further than a few standard deviations: where the step is
 longer, as of a delay that one stretch of an onset alone determines, predictions come from a descent without
-the group. The linear step of such a delay was 160, and its prediction 13 times as far off as that of a refit.
+the group. The linear step of such a delay was 160, and its prediction six times as far off.
 """
 
 from __future__ import annotations
@@ -62,12 +62,18 @@ def log_scores(optimum: Optimum, chosen: Sequence[Index]) -> Vector:
     whole = np.linalg.slogdet(optimum.information)[1]
     out = []
     for rows in chosen:
-        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
-        rest = optimum.information - tangents.T @ tangents
-        pull = tangents.T @ residual
+        residual = optimum.settled[rows]
+        rest, pull = _less(optimum, rows, residual)
         power = residual @ residual + pull @ np.linalg.solve(rest, pull)
         out.append(-0.5 * power + 0.5 * (np.linalg.slogdet(rest)[1] - whole))
     return np.array(out)
+
+
+def _less(optimum: Optimum, rows: Index, residual: Vector) -> tuple[Matrix, Vector]:
+    """Information of all samples but some, (k, k), and what these, by their whitened `residual`, add to the
+    slope of the log density, (k,)."""
+    tangents = optimum.jacobian[rows]
+    return optimum.information - tangents.T @ tangents, tangents.T @ residual
 
 
 def left_out_scores(state: State) -> list[Score]:
@@ -105,12 +111,12 @@ def _predicted(state: State, rows: Index) -> _Predicted:
     """One Gauss-Newton step away from the fit of all, or where that is far, at the end of a descent; not of
     several records with effects, each of which would take as long as a refit does."""
     optimum = state.optimum
-    tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
-    covariance: Matrix = np.linalg.inv(optimum.information - tangents.T @ tangents).astype(float)
-    step = -covariance @ (tangents.T @ residual)
+    rest, pull = _less(optimum, rows, optimum.settled[rows])
+    covariance: Matrix = np.linalg.inv(rest).astype(float)
+    step = -covariance @ pull
     mean, slopes = state.fitted[rows] + optimum.tangents[rows] @ step, optimum.tangents[rows]
-    bearable = len(state.whitening.samples) == 1 or not state.model.effects
-    if bearable and (np.abs(step) > _FAR * optimum.sd).any():
+    affordable = len(state.whitening.samples) == 1 or not state.model.effects
+    if affordable and (np.abs(step) > _FAR * optimum.sd).any():
         regression = Regression(state.model, state.whitening)
         end = descended(_Others(regression, rows), optimum.x[None], steps=_STEPS, least=GAIN)
         predicted, tangents = state.model.tangents(end.points[0])
@@ -137,10 +143,10 @@ class _Others:
             here = self.regression.at(x)
         except ArithmeticError:
             return -np.inf, np.zeros(x.size), np.eye(x.size)
-        tangents, residual = here.jacobian[self.left_out], here.white[self.left_out]
-        gradient = self.regression.gradient(here) - tangents.T @ residual
+        residual = here.white[self.left_out]
+        rest, pull = _less(here, self.left_out, residual)
         level = 0.5 * float(residual @ residual) - here.cost
-        return level, gradient, here.information - tangents.T @ tangents
+        return level, self.regression.gradient(here) - pull, rest
 
     def room(self, points: Matrix, /) -> tuple[Matrix, Matrix]:
         """Steps to the ends of the support."""

@@ -11,7 +11,7 @@ from lcopa_bayes.inference.spareterms import possible
 _RINGING = 1.75
 """Order of a term above which every swing of its element is more than half as large as the one before [-]."""
 _LEAST = 1e-3
-"""A delay that would become negative becomes so many half periods, if it is more than half a one [-]."""
+"""Half periods that a delay of more than half of one becomes where it would be negative [-]."""
 
 
 def half_a_period_away(posterior: Posterior, values: Vector) -> list[Vector]:

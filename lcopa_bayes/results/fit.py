@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
-_CONTRARY = 30.0
+CONTRARY = 30.0
 """Time for draws where records contradict each other grossly, which make no number usable [s]."""
 
 
@@ -308,16 +308,11 @@ def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Opt
     return resolved_optima(problem, optima_of(problem, starts=QUICK_STARTS if quick else STARTS))
 
 
-def budget_of(study: Study) -> float | None:
-    """Time for draws that a study states, or little for records that no plant follows [s]; None for any."""
-    if study.sampler.seconds is None and any(one.gross for one in study.disagreements):
-        return _CONTRARY
-    return study.sampler.seconds
-
-
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
-    """The sampling plan of a study."""
+    """The sampling plan of a study; with little time for records that no plant follows, unless it states
+    any."""
     wanted, study = problem.study.sampler, problem.study
+    seconds = CONTRARY if wanted.seconds is None and study.contradictory else wanted.seconds
     plan = SamplePlan.of(
         problem.posterior.dimension,
         seed=study.seed,
@@ -326,7 +321,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
-        seconds=budget_of(study),
+        seconds=seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

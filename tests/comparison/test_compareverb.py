@@ -13,17 +13,18 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.comparison.candidatefit import BUDGET, contender
+from lcopa_bayes.comparison.candidatefit import BUDGET, Contender, contender
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import save_record
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.report.compare import drawn
 from lcopa_bayes.report.pages import write_page_of
-from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.results.fit import CONTRARY, plan_of
 
 FEW = {"target_ess": 100}
 PICK = ("fractional-1", "first-order")
@@ -239,6 +240,21 @@ def test_candidates_have_a_budget_of_time_that_a_study_may_state(sampler, budget
     (one, *_) = candidates_of(study(record(), sampler=sampler), pick=PICK)
     made = contender(one, None, quick=False, resume=False)
     assert (made.candidate.study.sampler.seconds, made.patient.seconds) == (budget, budget)
+
+
+@pytest.mark.parametrize(("contrary", "budget"), [(False, BUDGET), (True, CONTRARY)])
+def test_records_that_no_plant_follows_have_little_time(monkeypatch, contrary, budget):
+    candidates, given = candidates_of(study(record()), pick=PICK), []
+
+    def noted(*_: object, budget: float, **__: object) -> Contender:
+        given.append(budget)
+        raise InputError("enough is known")
+
+    monkeypatch.setattr(Study, "contradictory", contrary)
+    monkeypatch.setattr("lcopa_bayes.comparison.compare.contender", noted)
+    with pytest.raises(InputError, match="enough is known"):
+        compare(candidates)
+    assert given == [budget]
 
 
 # -- measured records ------------------------------------------------------------------------------

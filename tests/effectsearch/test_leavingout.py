@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small import TRUTH, record, study
 
+from lcopa_bayes.bench.command import step
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.leavingout import groups, left_out_scores
 from lcopa_bayes.effectsearch.noise import Law
@@ -50,3 +51,21 @@ def test_a_part_left_out_is_predicted_as_by_a_fit_without_it(noise_sd, far):
         worst = max(worst, errors[1])
     assert (min(steps) > 3.0) == (max(steps) > 3.0) == far
     assert (worst > 2.0) == far
+
+
+def test_a_record_left_out_is_predicted_as_by_a_fit_of_the_others():
+    """A lag that follows steps of two lengths from two instants is not the same one."""
+    records = [
+        record(k, command=step(1.0, at=at), camera=0.05, duration=end, noise_sd=0.002, name=f"run{k}")
+        for k, (at, end) in enumerate([(0.35, 3.0), (1.0, 12.0)])
+    ]
+    own = study(*records, priors={"order_1": 1.0}, offset="shared")
+    state = state_of(own, 0.002)
+    rows, noise = groups(state.whitening), 0.002
+    for score, own_rows, other in zip(left_out_scores(state), rows, records[::-1], strict=True):
+        rest = state_of(replace(own, fit=(other,)), noise)
+        assert (np.abs(rest.optimum.x - state.optimum.x) > 10.0 * state.optimum.sd).any()
+        refit = state.model.predict(rest.optimum.x)[own_rows]
+        # a descent ends 1e-3 nat from its optimum
+        np.testing.assert_allclose(score.predicted, refit, rtol=0.0, atol=np.sqrt(2e-3) * noise)
+        assert np.isfinite(score.variance).all()
