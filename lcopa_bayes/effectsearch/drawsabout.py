@@ -1,4 +1,4 @@
-"""Draws about the optimum of a model: normal ones, and ones that follow the records where these are not.
+"""Draws about the optimum of a model that follow the records.
 
 The posterior of a plant with a term that the records do not need is no normal one: along a ridge the
 likelihood is flat, off it falls steeply, and most normal draws are plants that the records reject, by
@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import chi2, truncnorm
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
-from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
 
 _CHANCE = 1e-3
@@ -30,31 +30,26 @@ _SHORTER, _SHORTEST, _LONGER = 0.05, 1e-4, 1e6
 factor over a step at which a cost has not risen."""
 
 
-def normal_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
-    """Normal draws about an optimum, (count + 1, coordinates), the optimum first; some may be outside of the
-    support.
+def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
+    """Of `count` draws, those inside the support that follow the records, the optimum first, (draws,
+    coordinates); their likelihood is computed, and that of some steps along each principal axis.
 
     Coordinates that an end of their support holds are drawn on its inner side, each by itself, with the slope
     of the likelihood there: of normal draws of several of them at once none may be inside.
     """
-    shift, given = _held(state, rng, count)
-    free = ~state.optimum.stuck
-    shift[:, free] += rng.standard_normal((count, len(given))) @ root_of(given).T
-    return np.concatenate([state.optimum.x[None], state.optimum.x + shift])
-
-
-def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
-    """Of `count` draws, those inside the support that follow the records, the optimum first, (draws,
-    coordinates); their likelihood is computed, and that of some steps along each principal axis."""
     x, (low, high) = state.optimum.x, state.model.bounds
     regression = Regression(state.model, state.whitening)
 
+    def supported(many: Matrix) -> Flags:
+        return np.asarray(((many >= low) & (many <= high)).all(axis=1) & state.model.supported(many))
+
     def rises(many: Matrix) -> Vector:
-        out, inside = np.full(len(many), np.inf), ((many >= low) & (many <= high)).all(axis=1)
+        inside = supported(many)
+        out = np.full(len(many), np.inf)
         out[inside] = regression.costs(many[inside]) - state.optimum.cost
         return out
 
-    shift, given = _held(state, rng, count)
+    shift, given = _held(state.optimum, rng, count)
     free = np.flatnonzero(~state.optimum.stuck)
     spread = state.model.spread[free]
     power, axes = np.linalg.eigh(given / np.outer(spread, spread))
@@ -72,13 +67,19 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
         follow = rises(near) <= limit
         kept[left[follow]] = near[follow]
         left = left[~follow]
-    return np.concatenate([x[None], np.delete(kept, left, axis=0)])
+    kept = np.delete(kept, left, axis=0)
+    if state.spread is not None:
+        # what internal constants of effects leave open; the model of this likelihood holds them
+        beyond = root_of(state.spread - state.optimum.covariance)
+        moved = kept + rng.standard_normal((len(kept), x.size)) @ beyond.T
+        kept = np.where(supported(moved)[:, None], moved, kept)
+    return np.concatenate([x[None], kept])
 
 
-def _held(state: State, rng: np.random.Generator, count: int) -> tuple[Matrix, Matrix]:
+def _held(optimum: Optimum, rng: np.random.Generator, count: int) -> tuple[Matrix, Matrix]:
     """Shifts of the coordinates that an end of their support holds, and of the others by these, (count,
     coordinates); and the covariance of the others given them."""
-    optimum, whole, stuck = state.optimum, state.covariance, state.optimum.stuck
+    whole, stuck = optimum.covariance, optimum.stuck
     shift = np.zeros((count, optimum.x.size))
     slope, sd = (optimum.jacobian.T @ optimum.white)[stuck], np.sqrt(np.diag(whole))[stuck]
     steep = np.abs(slope) * sd

@@ -165,7 +165,7 @@ class ExtendedModel:
         """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,); terms that can
         be exchanged may be in any sequence."""
         values = np.array([self._least.values(each, self.template) for each in x])
-        table = self.posterior.table
+        values, table = values.reshape(len(x), self.template.size), self.posterior.table
         return table.supported(table.canonical(values))
 
     def values(self, x: Vector) -> Vector:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self, final
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.explained import coordinates_of
-from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.heldouteffects import missed, share_beyond_noise, unseen_share
+from lcopa_bayes.effectsearch.heldoutscores import held_out_scores
 from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.outliers import Outlying, without_outliers
@@ -19,8 +21,8 @@ from lcopa_bayes.effectsearch.scores import (
     State,
     apart,
     fit_scores,
-    held_out_scores,
     over_noise,
+    pooled_rmse,
     risen,
 )
 from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, RISEN, Findings
@@ -28,6 +30,11 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.sampling.draws import Draws
 
+_CONFIRMED = 0.9
+"""Share of the squared error beyond noise on unseen records that an effect beside others may leave [-]."""
+_UNFOLLOWED = 5.0, 0.03
+"""Error over noise, and over what the response varies, from which a model does not follow the records it was
+fitted to [-]."""
 _AWAY = 2.0
 """Distance of what draws predict from the prediction at the optimum beyond which they are elsewhere [sd of
 the latter]."""
@@ -64,6 +71,13 @@ class Side:
         where = "held out" if any(one.held_out for one in self.unseen) else "left out in turn"
         fitted, unseen = (over_noise(scores, scores, clear=False) for scores in (self.fit, self.unseen))
         return f"errors are {fitted:.2f} times the noise on fitted records, {unseen:.2f} on those {where}"
+
+
+def predicts_better(problem: Problem, larger: State, smaller: State) -> bool:
+    """Whether a model takes a part of the squared error beyond noise that one with fewer effects leaves on
+    unseen records, where that leaves any."""
+    was, now = (Side.of(problem, state).unseen for state in (smaller, larger))
+    return not share_beyond_noise(problem.study, was, now, larger) > _CONFIRMED
 
 
 def named_effects(state: State) -> tuple[str, ...]:
@@ -115,6 +129,25 @@ def findings_of(
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )
+
+
+def unfollowed(fit: Sequence[Score]) -> str:
+    """Why numbers of a model say nothing of the plant: the response that it follows least of the records it
+    was fitted to, a clause without a full stop; empty where it follows all."""
+    worst, said = 0.0, ""
+    for axis in sorted({one.axis for one in fit}):
+        own = [one for one in fit if one.axis == axis]
+        error = pooled_rmse(own, axis)
+        apart = np.concatenate([one.observed - one.observed.mean() for one in own])
+        above, share = error / own[0].noise_sd, error / (float(np.sqrt(np.mean(apart**2))) or np.inf)
+        if above > _UNFOLLOWED[0] and share > max(worst, _UNFOLLOWED[1]):
+            worst = share
+            said = (
+                f"the model does not follow the records that it was fitted to: the error of {axis} is "
+                f"{above:.3g} times the noise, {100 * share:.2g} % of what the response varies, and "
+                "intervals of its numbers say nothing of the plant"
+            )
+    return said
 
 
 def astray(optimum: Side, drawn: Side) -> bool:

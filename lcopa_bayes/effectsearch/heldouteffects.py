@@ -29,15 +29,20 @@ _SEED = 9
 
 
 def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], state: State) -> float:
-    """Squared error beyond noise on held-out records, with the effects over without [-].
-
-    Over samples before the drive leaves the range it has in the fitted records; what the effects leave
-    uncertain is no error of either. NaN where it says nothing: no such error, or effects that all differ from
-    record to record.
-    """
+    """`share_beyond_noise` on held-out records; NaN for effects that all differ from record to record."""
     effects = state.model.effects
     if effects and all(effect.card.per_record for effect in effects):
         return np.nan
+    return share_beyond_noise(study, before, after, state)
+
+
+def share_beyond_noise(study: Study, before: Sequence[Score], after: Sequence[Score], state: State) -> float:
+    """Squared error beyond noise on unseen records, with effects over with fewer or none [-]; NaN where
+    there is no such error.
+
+    Over samples before the drive leaves the range it has in the fitted records; what the effects leave
+    uncertain is no error of either.
+    """
     # one noise for both: a fit without the effects may have taken them for noise
     noise = [(one.noise_sd, one.variance) for one in after]
     was = _errors(study, before, state, noise)
@@ -232,6 +237,8 @@ def _left(study: Study, name: str) -> float:
     """When a record's drive leaves the range of the other, fitted ones [time unit]; infinite if never."""
     record = next(one for one in (*study.fit, *study.held_out) if one.name == name)
     others = [one.drive for one in study.fit if one.name != name]
+    if not others:
+        return np.inf
     low, high = (pick([pick(one, axis=0) for one in others], axis=0) for pick in (np.min, np.max))
     room = _ROOM * (high - low)
     beyond = ((record.drive < low - room) | (record.drive > high + room)).any(axis=1)

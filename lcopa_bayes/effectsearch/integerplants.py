@@ -15,6 +15,7 @@ from typing import final
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.heldoutscores import held_out_scores
 from lcopa_bayes.effectsearch.lags import linear
 from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.lesseffects import descended_with_effects, following, less_effects
@@ -22,7 +23,7 @@ from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.refits import without
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.scores import State, fit_scores, held_out_scores, over_noise
+from lcopa_bayes.effectsearch.scores import State, fit_scores, over_noise
 from lcopa_bayes.effectsearch.verdict import MARGIN, REACHED, Dynamics
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, final
+from typing import Any, cast, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,12 +18,20 @@ from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.requirements import not_at_rest
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.acceptance import single_record
 from lcopa_bayes.effectsearch.bandwidening import Widening
-from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
+from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
 from lcopa_bayes.effectsearch.basemodel import Base, beside_effects, fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
-from lcopa_bayes.effectsearch.findings import Side, astray, findings_of, named_effects
+from lcopa_bayes.effectsearch.findings import (
+    Side,
+    astray,
+    findings_of,
+    named_effects,
+    predicts_better,
+    unfollowed,
+)
 from lcopa_bayes.effectsearch.freedconstants import released
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.integerplants import integer_dynamics
@@ -44,7 +52,7 @@ from lcopa_bayes.effectsearch.openeffects import (
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
-from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
+from lcopa_bayes.effectsearch.rounds import Round, Search, search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import (
@@ -57,7 +65,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
-from lcopa_bayes.sampling.convergence import Grade
+from lcopa_bayes.sampling.convergence import Grade, Level
 from lcopa_bayes.sampling.draws import Draws
 
 _WORTHWHILE = 2.0
@@ -97,6 +105,9 @@ class Loop:
     """Samples left out before anything was traced; None without any."""
     contrary: tuple[Disagreement, ...] = ()
     """Records that disagree."""
+    loose: State | None = None
+    """The final model under the noise that its residual has, where something significant remains and nothing
+    was sampled; None elsewhere. Measured noise would give intervals of a plant known to be another."""
     open: tuple[Alternative, ...] = ()
     """Effects that the records leave open beside, or in place of, those of the final model."""
     lags: tuple[SumOfLags, ...] = ()
@@ -114,22 +125,21 @@ class Loop:
     def grade(self) -> Grade:
         """How far the numbers can be trusted: as far as verdict and model, and without draws no further
         than a Laplace approximation."""
-        if self.draws is not None:
-            if self._limit and self.draws.grade.level == "reliable":
-                return Grade("tentative", f"the draws are reliable, but {self._limit}")
-            return self.draws.grade
-        return Grade(
+        own = Grade(
             "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
         )
+        return self._limited(own if self.draws is None else self.draws.grade)
 
-    @property
-    def _limit(self) -> str:
-        """Why no number is reliable, however well it was sampled; empty where it may be."""
+    def _limited(self, own: Grade) -> Grade:
+        """A grade, or that of any number of this loop, however well it was sampled, if it is worse."""
+        said = unfollowed(self.after.fit)
+        if said:
+            return Grade.worst((own, Grade("unusable", said)))
         if self.verdict.confidence == "tentative":
-            return "the verdict that they rest on is tentative"
-        if self.verdict.leaves and all(one.support == "plant" for one in self.lags):
-            return "the records hold something that the model they are of does not explain"
-        return ""
+            said = "the verdict that they rest on is tentative"
+        elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
+            said = "the records hold something that the model they are of does not explain"
+        return Grade.worst((own, Grade("tentative", f"the draws are reliable, but {said}"))) if said else own
 
     def estimate(self, k: int) -> dict[str, Any]:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
@@ -137,11 +147,11 @@ class Loop:
         model `alone`."""
         here = self.number(k)
         if self.draws is None:
-            return here.as_json(ess=np.nan, grade="tentative", interval="Laplace")
+            return here.as_json(ess=np.nan, grade=self.grade.level, interval="Laplace")
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
         ess = ess_with_lags(own.ess, self.lags)
-        grade = "tentative" if self._limit and own.grade == "reliable" else own.grade
+        grade = self._limited(Grade(cast("Level", own.grade), "")).level
         return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:
@@ -173,7 +183,7 @@ class Loop:
     def _mixture(self) -> tuple[list[Matrix], Vector]:
         state = self.after.state
         if self.draws is None:
-            return mixture(state, None, self.open)
+            return mixture(self.loose or state, None, self.open)
         beyond = [one for one in self.open if not one.within(self.draws.table)]
         return mixture(state, coordinates_of(state.model, self.draws), beyond)
 
@@ -305,7 +315,16 @@ def _looped(
         before = before if named else after
     after = Side.of(problem, state) if sampled is None and state is not after.state else after
     crew.stage(f"{verdict.kind}; weighing what else the records leave open")
-    found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
+    loose = None
+    if sampled is None and state.widening is not None:
+        optimum, white = settled(state.model, state.optimum, state.whitening)
+        loose = State(state.model, optimum, white)
+    # the noise of what remains holds any effect that may be open
+    found = (
+        alternatives(searched.state, searched.rounds)
+        if verdict.kind != "unexplained" and loose is None
+        else ()
+    )
     if extended:
         plants = PlantsBeside.of(state, problem, others, crew)
         lags = plants.held_against(lags, state, problem)
@@ -320,6 +339,7 @@ def _looped(
         draws=sampled[0] if sampled is not None else None,
         outliers=outliers,
         contrary=contrary,
+        loose=loose,
         open=found,
         lags=lags,
         plants=plants,
@@ -330,6 +350,7 @@ def _searched(base: Base, rounds: Callable[..., Search]) -> Search:
     """Rounds under the noise that was measured; where too few samples at rest measured it and nothing stands
     out, again under noise known from the residual alone."""
     fit = base.fit
+    rounds = partial(rounds, better=partial(predicts_better, base.problem))
     found = rounds(base.start, noise_samples=fit.noise_samples, first=base.look)
     if fit.noise_known and not found.rounds[-1].trace.alarmed:
         found = found.settled

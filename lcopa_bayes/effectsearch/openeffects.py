@@ -20,7 +20,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
-from lcopa_bayes.effectsearch.drawsabout import normal_draws
+from lcopa_bayes.effectsearch.drawsabout import likely_draws
 from lcopa_bayes.effectsearch.freedconstants import loosened
 from lcopa_bayes.effectsearch.refits import log_bayes_factor, places, without
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
@@ -40,6 +40,8 @@ _CERTAIN = 300.0
 """Evidence beyond which odds do not grow [nat]."""
 _DRAWS = 4000
 """Draws of all models together [-]."""
+_FOLLOWING = 1000
+"""Draws about an optimum whose likelihood is computed [-]."""
 _RESPONSES = 400
 """Step responses of all models together [-]."""
 _FEWEST = 10
@@ -97,8 +99,8 @@ def alternatives(state: State, rounds: Sequence[Round]) -> tuple[Alternative, ..
 
 
 def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> tuple[list[Matrix], Vector]:
-    """Draws of the final model, `own` or else normal ones about its optimum, and of each alternative, inside
-    the support of the coordinates; and their weights, which add up to 1."""
+    """Draws of the final model, `own` or else those about its optimum that follow the records, and of each
+    alternative, inside the support of the coordinates; and their weights, which add up to 1."""
     rng = np.random.default_rng(_SEED)
     x, (low, high) = state.optimum.x, state.model.bounds
 
@@ -107,8 +109,7 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
-        own = normal_draws(state, rng, _DRAWS)
-        own = own[within(own)]
+        own = likely_draws(state, rng, _FOLLOWING)
     parts, weights = [own], [1.0]
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)

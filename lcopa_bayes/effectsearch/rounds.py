@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Self, final
@@ -10,7 +10,7 @@ from typing import Self, final
 import numpy as np
 
 from lcopa_bayes.core.crew import ALONE, Crew
-from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.acceptance import acceptable, accepted, beside_dynamics, large, leader
 from lcopa_bayes.effectsearch.basefit import settled
 from lcopa_bayes.effectsearch.candidates import refitted
 from lcopa_bayes.effectsearch.refits import (
@@ -35,11 +35,6 @@ from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
 """Effects that are added at most [-]."""
-SINGLE = 0.3
-"""Share of the residual's power that an effect must take when a single record is all there is [-]."""
-CLEAR = 1.5
-"""Residual over noise from which a single record names anything: its noise may differ from level to level
-[-]."""
 _PAIRED = 8
 """Single effects of which pairs are formed [-]."""
 _PAIRS = 2
@@ -103,6 +98,21 @@ class Search:
     """Least log evidence that one of the effects brought, when it was added or beside the others [nat];
     infinite without any."""
 
+    @classmethod
+    def ending(
+        cls, rounds: Sequence[Round], start: State, state: State, groups: Mapping[str, tuple[str, ...]]
+    ) -> Self:
+        """With the state that the last round looked at."""
+        last = rounds[-1].trace
+        confounded = (groups.get(effect.name, (effect.name,)) for effect in state.model.effects)
+        gained, dropped = _gained(start, state, last.scale.quiet)
+        left = last.scale.drop(rounds[-1].largest) if last.alarmed else 0.0
+        share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
+        worth = [one.chosen.log_bayes_factor for one in rounds if one.chosen]
+        worth += _beside_others(state, last.scale.quiet)
+        least = min(worth, default=np.inf)
+        return cls(tuple(rounds), state, tuple(confounded), gained, share, least)
+
     @property
     def apart(self) -> bool:
         """Whether every effect brought enough evidence for a firm name and is confounded with no other, and
@@ -134,17 +144,25 @@ def search(
     draws: int,
     alone: bool = False,
     first: Round | None = None,
+    better: Callable[[State, State], bool] = lambda larger, smaller: True,
     crew: Crew = ALONE,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that is `alone` only large ones; then try pairs where something remains, and
-    take back what is no longer significant. The `first` look may be known already."""
-    state, rounds = start, []
+    take back what is no longer significant. The `first` look may be known already.
+
+    Where something remains, each of several effects has to predict unseen records `better` than without it:
+    what remains is no noise, and one more effect takes up some of it whether or not it is there.
+    """
+
+    def look_at(state: State) -> Round:
+        return Round(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
+
+    state, rounds, looked = start, list[Round](), list[State]()
     groups: dict[str, tuple[str, ...]] = {}
     for number in range(MOST + 1):
-        look = first if first is not None and not number else None
-        if look is None:
-            look = Round(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
+        looked.append(state)
+        look = first if first is not None and not number else look_at(state)
         seen = look.trace
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen))
@@ -155,8 +173,8 @@ def search(
         refits = look.refits
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
-        likely = [one for one in accepted(refits, seen, bar) if not alone or _large(one)]
-        chosen = _leader(_beside_dynamics(likely, [one for one in refits if one.dynamics]))
+        likely = [one for one in accepted(refits, seen, bar) if not alone or large(one)]
+        chosen = leader(beside_dynamics(likely, [one for one in refits if one.dynamics]))
         if chosen is not None and chosen.dynamics and groups:
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
         rounds.append(replace(look, chosen=chosen))
@@ -165,22 +183,23 @@ def search(
         if not chosen.dynamics:
             groups[chosen.added[0]] = group(state, chosen, refits, seen)
         state = _kept(chosen)
+    while rounds[-1].alarmed and looked[:-1] and looked[-2].model.effects and not better(*looked[:-3:-1]):
+        looked.pop()
+        rounds.pop()
+        rounds[-1], state = replace(rounds[-1], chosen=None), looked[-1]
     unnamed = any(effect.card.dynamics for effect in state.model.effects)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
-        paired = _paired(start, state, rounds[0].trace)
-        if paired is not None:
-            state = paired.state
-            seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
-            rounds += [Round(rounds[0].trace, (paired,), chosen=paired), Round(seen)]
-    names = [effect.name for effect in state.model.effects]
-    confounded = tuple(groups.get(name, (name,)) for name in names)
-    gained, dropped = _gained(start, state, float(sum(noise_samples)))
-    last = rounds[-1].trace
-    left = last.scale.drop(last.largest) if last.alarmed else 0.0
-    share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
-    worth = [one.chosen.log_bayes_factor for one in rounds if one.chosen]
-    worth += _beside_others(state, float(sum(noise_samples)))
-    return Search(tuple(rounds), state, confounded, gained, share, min(worth, default=np.inf))
+        pair = _paired(start, state, rounds[0].trace)
+        if pair is not None:
+            look = look_at(pair.state)
+            kept: Refit | None = pair
+            if look.alarmed:
+                kept = _both(start, state, pair, better)
+                look = look if kept is pair or kept is None else look_at(kept.state)
+            if kept is not None:
+                state = kept.state
+                rounds += [Round(rounds[0].trace, (kept,), chosen=kept), look]
+    return Search.ending(rounds, start, state, groups)
 
 
 def _beside_others(state: State, quiet: float) -> list[float]:
@@ -205,76 +224,6 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
     gained = log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
     return gained, plain.cost - state.optimum.cost
-
-
-def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
-    """Refits that may be kept, by falling evidence.
-
-    What linear dynamics without a name explain as well is no evidence of a name: a zero, a further lag, or
-    paths that differ in what the model lets them share look like many effects.
-    """
-    linear = max((one.log_bayes_factor for one in refits if one.dynamics), default=-np.inf)
-    ahead = (one for one in refits if one.dynamics or one.log_bayes_factor > linear + MARGIN)
-    # beside such dynamics a linear effect is one more of them
-    ahead = (one for one in ahead if one.dynamics or not (one.linear and one.unnamed))
-    return [one for one in ahead if _accepted(one, seen, bar)]
-
-
-def _beside_dynamics(likely: Sequence[Refit], dynamics: Sequence[Refit]) -> list[Refit]:
-    """Accepted refits from the first on that linear `dynamics` leave something to explain.
-
-    A linear effect is one of the dynamics; it must remain beside those of no more coefficients, and beats
-    the others by its few. Any other effect must remain beside each of them.
-    """
-    for number, one in enumerate(likely):
-        rivals = [each for each in dynamics if not (one.linear and len(each.new) > len(one.new))]
-        if one.dynamics or all(_remains(rival, one) for rival in rivals):
-            return list(likely[number:])
-    return []
-
-
-def _remains(linear: Refit, candidate: Refit) -> bool:
-    """Whether the effects of a refit are worth naming beside linear dynamics.
-
-    They are where they are ahead by more than the coefficients of these can cost.
-    """
-    if candidate.log_bayes_factor - linear.log_bayes_factor > MARGIN * (1 + len(linear.new)):
-        return True
-    kept = {e.name for e in linear.model.effects}
-    sizes = candidate.model.sizes(candidate.optimum.x)
-    added = [(effect, size) for effect, size in sizes if effect.name not in kept]
-    try:
-        both = refit(linear.model, linear.optimum, linear.whitening, added, linear.quiet)
-    except ArithmeticError:
-        return False
-    return both.log_bayes_factor > MARGIN and both.significant
-
-
-def _accepted(candidate: Refit, seen: Trace, bar: float) -> bool:
-    generics = (g for g in seen.traced if g.card.place == "generic")
-    others = (g for g in generics if not (candidate.dynamics and g.card.dynamics))
-    generic = max((g.log_bayes_factor for g in others), default=-np.inf)
-    ahead = candidate.log_bayes_factor > generic + MARGIN
-    return (
-        candidate.log_bayes_factor > bar
-        and ahead
-        and candidate.left_out > 0
-        and candidate.significant
-        and candidate.resting
-        and candidate.possible
-    )
-
-
-def _large(candidate: Refit) -> bool:
-    return candidate.taken > SINGLE and candidate.excess > CLEAR
-
-
-def _leader(accepted: Sequence[Refit]) -> Refit | None:
-    """The refit of largest evidence; of those level with it the first whose coefficients all records share,
-    since one of a single record predicts no other."""
-    level = [one for one in accepted if one.log_bayes_factor > accepted[0].log_bayes_factor - MARGIN]
-    shared = (one for one in level if not any(c.record is not None for c in one.new))
-    return next(shared, accepted[0] if accepted else None)
 
 
 def _kept(candidate: Refit) -> State:
@@ -319,9 +268,28 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
         except ArithmeticError:
             continue
         candidate = replace(under_one_noise([candidate])[0], paid=candidate.paid - choice)
-        if candidate.log_bayes_factor > bar and _accepted(candidate, seen, seen.threshold):
+        if candidate.log_bayes_factor > bar and acceptable(candidate, seen, seen.threshold):
             bar, best = candidate.log_bayes_factor, candidate
     return best
+
+
+def _both(start: State, state: State, pair: Refit, better: Callable[[State, State], bool]) -> Refit | None:
+    """A pair of which each effect predicts unseen records better beside the other; else the one of them that
+    does as well alone, when its evidence beats what was found one by one."""
+    alone = []
+    for effect, size in pair.model.sizes(pair.optimum.x):
+        others = [name for name in pair.added if name != effect.name]
+        near = pair.without(others)[1]
+        try:
+            one = refit(start.model, start.optimum, start.whitening, [(effect, size)], pair.quiet, near)
+        except ArithmeticError:
+            continue
+        if not better(pair.state, one.state):
+            alone.append(one)
+    if not alone:
+        return pair
+    best = max(alone, key=lambda one: one.log_bayes_factor)
+    return best if best.log_bayes_factor > _gained(start, state, pair.quiet)[0] + MARGIN else None
 
 
 def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:
@@ -352,16 +320,3 @@ def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> 
         if margin < MARGIN:
             out.append(one.name)
     return tuple(out)
-
-
-def single_record(study: Study) -> tuple[str, ...]:
-    """What a single record leaves open."""
-    if len(study.fit) > 1:
-        return ()
-    said = "an effect of the device and a peculiarity of a single record are confounded"
-    if not study.held_out:
-        said += (
-            f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
-            f"{100 * SINGLE:.0f} % of its power"
-        )
-    return (f"{said}; fit a second record",)

@@ -3,35 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import HALF_WIDTH, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.whitening import Whitening
-from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.declared import campaign_places
-from lcopa_bayes.inference.noise import Noise, WhiteAR1
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.parameter import Parameter, Place
-from lcopa_bayes.model.effects.declared import Declared
-from lcopa_bayes.model.effects.effect import UnstableError
-from lcopa_bayes.results.prediction import axis_draws
 from lcopa_bayes.sampling.draws import Draws
-
-_DRAWS = 100
-"""Draws about an optimum behind the prediction of a held-out record [-]."""
-_MOST = 400
-"""The same of a sampled posterior, at most [-]."""
-_TRIES = 4
-"""Draws for each of them within the support [-]."""
 
 
 @final
@@ -128,64 +114,6 @@ def fit_scores(state: State) -> list[Score]:
     return scores_of(state, state.fitted, variance, "the fit", own_levels=False)
 
 
-def held_out_scores(state: State, problem: Problem) -> list[Score]:
-    """On the study's held-out records, predicted as a fit predicts them: by draws, with levels by its rule.
-
-    What effects differ in from record to record is as large as on the fit records, and adds to the variance.
-    """
-    study = problem.study
-    samples, model = problem.simulated(study.held_out)
-    if state.model.effects:
-        places = campaign_places(study)
-        own = Declared(
-            tuple(type(effect) for effect in state.model.effects),
-            state.model.effected.ranges,
-            np.array([places[record.name] for record in study.held_out]),
-            tuple(one.times for one in samples),
-            (None,) * len(samples),
-        )
-        model = replace(model, effects=own)
-    draws, noise = state.sampled or _laplace(state, study.seed)
-    draws, out = replace(draws, values=draws.thinned(_MOST)[None]), []
-    drawn = axis_draws(draws, model, samples, noise, held_out=True, seed=study.seed)
-    for record, axis, _, plant, seen, (level, source, _), _ in drawn:
-        bounded = np.isfinite(seen).all(axis=1)
-        if not bounded.any():
-            names = tuple(effect.name for effect in state.model.effects)
-            raise UnstableError(names, record.record.name, "no draw has a bounded response")
-        # what differs from record to record is 0 on average
-        mean = plant[bounded].mean(axis=0) + level[bounded].mean()
-        apart = (seen + level[:, None])[bounded]
-        one = _score(state, record, axis, (mean, apart.var(axis=0)), source, held_out=True)
-        out.append(replace(one, draws=apart - apart.mean(axis=0)))
-    return out
-
-
-def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
-    """Normal draws about an optimum within its support, as draws of a table with the noise of the loop;
-    coordinates at an end of their support stay there."""
-    model, optimum, rng = state.model, state.optimum, np.random.default_rng([seed, 14])
-    free = np.flatnonzero(~optimum.stuck)
-    covariance = covariance_of(optimum.information[np.ix_(free, free)])
-    x = np.tile(optimum.x, (_TRIES * _DRAWS, 1))
-    x[:, free] += rng.standard_normal((len(x), free.size)) @ root_of(covariance).T
-    low, high = model.bounds
-    inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
-    inside &= model.supported(x)
-    x = np.concatenate([x[inside][:_DRAWS], optimum.x[None]])
-    table = model.posterior.table
-    rows = [k for k, row in enumerate(table.rows) if not row.noise]
-    values = np.array([model.values(each) for each in x])[:, rows]
-    noise = [
-        Parameter(name, "", name, Place(axis, 0), None, float(value))
-        for axis, law in enumerate(state.whitening.weighed)
-        for name, value in zip(WhiteAR1.names, law.parameters, strict=True)
-    ]
-    held = replace(table, rows=(*(table.rows[k] for k in rows), *noise))
-    values = np.hstack([values, np.tile([row.value for row in noise], (len(values), 1))])
-    return Draws(held, values[None], np.zeros((1, len(values))), (), float(_DRAWS)), WhiteAR1()
-
-
 def own_levels_of(state: State) -> bool:
     """Whether every record has an offset of its own."""
     table = state.model.plant.table
@@ -205,11 +133,11 @@ def scores_of(
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         held_out = level_from != "the fit"
-        out.append(_score(state, part.samples, part.axis, (centre, spread), source, held_out=held_out))
+        out.append(score_of(state, part.samples, part.axis, (centre, spread), source, held_out=held_out))
     return out
 
 
-def _score(
+def score_of(
     state: State,
     record: Samples,
     axis: int,

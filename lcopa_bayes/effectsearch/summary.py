@@ -16,7 +16,7 @@ from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
-from lcopa_bayes.model.effects.effect import Card
+from lcopa_bayes.model.effects.effect import Card, Effect
 from lcopa_bayes.results.sumsoflags import sentence_of
 
 FAR = 2.0
@@ -124,7 +124,7 @@ def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
                 "group": list(result.groups[number]),
                 "nearest": _nearest(result, effect.name),
                 "probability": chances.get(effect.name),
-                "constants": effect.constants,
+                "constants": _constants(result, effect),
                 "parameters": [
                     result.estimate(first + k)
                     | {"prior_sd": float(model.scale[k]), "one_signed": one.coefficient.one_signed}
@@ -135,6 +135,14 @@ def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _constants(result: Loop, effect: Effect) -> list[dict[str, Any]]:
+    """Internal constants of an effect."""
+    ranges, time = result.after.state.model.effected.ranges, result.problem.study.time_unit
+    units = {"time": time, "1/time": f"1/{time}"}
+    known = {one.name: units.get(one.unit, one.unit) for one in effect.internal(ranges)}
+    return [{"name": key, "value": value, "unit": known[key]} for key, value in effect.constants.items()]
 
 
 def _figures(result: Loop) -> list[dict[str, Any]]:
@@ -156,7 +164,7 @@ def _open(result: Loop) -> list[dict[str, Any]]:
         weights[key] = weights.get(key, 0.0) + one.weight
     return [
         {"name": name, "instead": bool(instead), "weight": weight}
-        | {"said": f"{name}{f' in place of {instead}' if instead else ''} (weight {weight:.2f} beside 1)"}
+        | {"said": f"{name}{f' in place of {instead}' if instead else ''} (weight {weight:.3g} beside 1)"}
         for (name, instead), weight in sorted(weights.items(), key=lambda one: -one[1])
         if weight > SHOWN
     ]

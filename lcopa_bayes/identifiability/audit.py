@@ -46,9 +46,9 @@ from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import UnstableError
-from lcopa_bayes.results.adequacy import unresolved
 from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.results.resonances import unresolved
 from lcopa_bayes.results.sensitivity import sensitivity
 
 _MOVED = 0.2
@@ -232,7 +232,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, ground.posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
-    fast = unresolved(fit.draws, scales.period)
+    fast = unresolved(fit.problem, fit.draws)
     findings = tuple(
         judged(
             *(profile, belief, symmetric, curved, _flat(row), Tolerance.of(row, scales)),

@@ -15,7 +15,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.drawsabout import _scales, likely_draws, normal_draws
+from lcopa_bayes.effectsearch.drawsabout import _scales, likely_draws
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.model.path import TransferPath
@@ -60,7 +60,8 @@ def test_they_follow_the_records_where_normal_draws_do_not(terms: int) -> None:
     """Terms that nothing needs: most draws do, of one of them, and several times as many as normal ones."""
     state = at_optimum(terms)
     limit, (low, high) = chi2.isf(1e-3, state.optimum.x.size) / 2, state.model.bounds
-    normal = normal_draws(state, np.random.default_rng(1), COUNT // 10)
+    rng = np.random.default_rng(1)
+    normal = rng.multivariate_normal(state.optimum.x, state.covariance, COUNT // 10, method="eigh")
     inside = normal[((normal >= low) & (normal <= high)).all(axis=1)]
     follow = int((rises(state, inside) <= limit).sum())
     likely = likely_draws(state, np.random.default_rng(1), COUNT // 10)
@@ -71,8 +72,8 @@ def test_they_follow_the_records_where_normal_draws_do_not(terms: int) -> None:
 
 def test_the_optimum_is_first() -> None:
     state = at_optimum(1)
-    for draws in (normal_draws, likely_draws):
-        np.testing.assert_array_equal(draws(state, np.random.default_rng(0), 5)[0], state.optimum.x)
+    first = likely_draws(state, np.random.default_rng(0), 5)[0]
+    np.testing.assert_array_equal(first, state.optimum.x)
 
 
 @pytest.mark.parametrize("wanted", [1.0, 0.3, 0.01])

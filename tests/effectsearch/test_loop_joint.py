@@ -11,11 +11,11 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.effectsearch.acceptance import SINGLE
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.mendedstudy import started
-from lcopa_bayes.effectsearch.rounds import SINGLE
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature
 from lcopa_bayes.effectsearch.trace import Traced, _chance
 from lcopa_bayes.effectsearch.whitening import Whitening

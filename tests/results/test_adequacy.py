@@ -13,10 +13,11 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.results.adequacy import RESONANCE_PEAK, _coverage, limitations, peaks, unresolved
+from lcopa_bayes.results.adequacy import _coverage, limitations
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.results.prediction import bands
 from lcopa_bayes.results.residuals import residuals
+from lcopa_bayes.results.resonances import RESONANCE_PEAK, peaks, unresolved
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
@@ -250,7 +251,7 @@ def test_an_undamped_resonance_faster_than_the_samples_is_no_plant(time, order, 
     assert bool(reported) == named
     if named:
         assert reported[0].level == "unusable"
-        (one,) = unresolved(draws, made.scales.period)
+        (one,) = unresolved(made, draws)
         assert one.samples == pytest.approx(2 * np.pi * time / 0.2, rel=0.03)
         assert f"{one.samples:.2g} sampling periods" in reported[0].reason
 

@@ -1,0 +1,74 @@
+"""Errors on records held out, predicted as a fit predicts them: by draws, with levels by its rule."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lcopa_bayes.effectsearch.drawsabout import likely_draws
+from lcopa_bayes.effectsearch.scores import Score, State, score_of
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.declared import campaign_places
+from lcopa_bayes.inference.noise import Noise, WhiteAR1
+from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.results.prediction import axis_draws
+from lcopa_bayes.sampling.draws import Draws
+
+_DRAWS = 100
+"""Draws about an optimum behind the prediction of a held-out record [-]."""
+_MOST = 400
+"""The same of a sampled posterior, at most [-]."""
+_STREAM = 14
+
+
+def held_out_scores(state: State, problem: Problem) -> list[Score]:
+    """On the study's held-out records.
+
+    What effects differ in from record to record is as large as on the fit records, and adds to the variance.
+    """
+    study = problem.study
+    samples, model = problem.simulated(study.held_out)
+    if state.model.effects:
+        places = campaign_places(study)
+        own = Declared(
+            tuple(type(effect) for effect in state.model.effects),
+            state.model.effected.ranges,
+            np.array([places[record.name] for record in study.held_out]),
+            tuple(one.times for one in samples),
+            (None,) * len(samples),
+        )
+        model = replace(model, effects=own)
+    draws, noise = state.sampled or _about_optimum(state, study.seed)
+    draws, out = replace(draws, values=draws.thinned(_MOST)[None]), []
+    drawn = axis_draws(draws, model, samples, noise, held_out=True, seed=study.seed)
+    for record, axis, _, plant, seen, (level, source, _), _ in drawn:
+        bounded = np.isfinite(seen).all(axis=1)
+        if not bounded.any():
+            names = tuple(effect.name for effect in state.model.effects)
+            raise UnstableError(names, record.record.name, "no draw has a bounded response")
+        # what differs from record to record is 0 on average
+        mean = plant[bounded].mean(axis=0) + level[bounded].mean()
+        apart = (seen + level[:, None])[bounded]
+        one = score_of(state, record, axis, (mean, apart.var(axis=0)), source, held_out=True)
+        out.append(replace(one, draws=apart - apart.mean(axis=0)))
+    return out
+
+
+def _about_optimum(state: State, seed: int) -> tuple[Draws, Noise]:
+    """Draws about an optimum that follow the records, as draws of a table with the noise of the loop."""
+    model = state.model
+    x = likely_draws(state, np.random.default_rng([seed, _STREAM]), _DRAWS)
+    table = model.posterior.table
+    rows = [k for k, row in enumerate(table.rows) if not row.noise]
+    values = np.array([model.values(each) for each in x])[:, rows]
+    noise = [
+        Parameter(name, "", name, Place(axis, 0), None, float(value))
+        for axis, law in enumerate(state.whitening.weighed)
+        for name, value in zip(WhiteAR1.names, law.parameters, strict=True)
+    ]
+    held = replace(table, rows=(*(table.rows[k] for k in rows), *noise))
+    values = np.hstack([values, np.tile([row.value for row in noise], (len(values), 1))])
+    return Draws(held, values[None], np.zeros((1, len(values))), (), float(_DRAWS)), WhiteAR1()
