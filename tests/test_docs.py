@@ -29,7 +29,7 @@ from lcopa_bayes.data.studyfile import load_candidates, load_study
 from lcopa_bayes.identifiability import verdict as audit
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.results import adequacy, discretisation
+from lcopa_bayes.results import adequacy, discretisation, resonances
 from lcopa_bayes.sampling import convergence, evidence
 from lcopa_bayes.sampling.run import SamplePlan
 
@@ -159,8 +159,9 @@ def test_documented_limits_of_grades_are_those_of_the_code():
     assert numbers(warnings["noise at the end of its prior"][0]) == [100 * adequacy._END]
     assert f"{discretisation.LARGEST:g} sd" in warnings["blocks too wide"][0]
     assert f"{discretisation.UNUSABLE:g} sd" in warnings["blocks too wide"][0]
-    assert numbers(warnings["resonance faster than the samples"][0]) == [100 * adequacy.RESONANCE_SHARE]
-    assert adequacy.DISTURBANCE_SHARE == 0.5
+    resonant = [100 * resonances.RESONANCE_SHARE, 100 * resonances.CONFIRMED]
+    assert numbers(warnings["resonance faster than the samples"][0]) == resonant
+    assert resonances.DISTURBANCE_SHARE == 0.5
     reported = numbers(sections(ROOT / "docs" / "statistics.md")["Evidence"])
     assert {evidence._RELIABLE, evidence._TENTATIVE} <= set(reported)
 
