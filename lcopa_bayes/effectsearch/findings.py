@@ -30,7 +30,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.sampling.draws import Draws
 
-_CONFIRMED = 0.9
+CONFIRMED = 0.9
 """Share of the squared error beyond noise on unseen records that an effect beside others may leave [-]."""
 _UNFOLLOWED = 5.0, 0.03
 """Error over noise, and over what the response varies, from which a model does not follow the records it was
@@ -77,7 +77,7 @@ def predicts_better(problem: Problem, larger: State, smaller: State) -> bool:
     """Whether a model takes a part of the squared error beyond noise that one with fewer effects leaves on
     unseen records, where that leaves any."""
     was, now = (Side.of(problem, state).unseen for state in (smaller, larger))
-    return not share_beyond_noise(problem.study, was, now, larger) > _CONFIRMED
+    return not share_beyond_noise(problem.study, was, now, larger) > CONFIRMED
 
 
 def named_effects(state: State) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.effectsearch import candidates, rounds, trace, verdict
+from lcopa_bayes.effectsearch import acceptance, candidates, findings, rounds, trace, verdict
 from lcopa_bayes.report.page import Verdict, write_page
 
 HERE = Path(__file__).parent
@@ -80,10 +80,11 @@ def frozen() -> dict[str, Any]:
         "alone": verdict.ALONE,
         "firm": verdict.FIRM,
         "reached": verdict.REACHED,
-        "single": rounds.SINGLE,
-        "clear": rounds.CLEAR,
+        "single": acceptance.SINGLE,
+        "clear": acceptance.CLEAR,
         "margin": verdict.MARGIN,
         "unseen": verdict.UNSEEN,
+        "confirmed": findings.CONFIRMED,
         "least": trace.LEAST,
         "quantile": trace.QUANTILE,
         "seen": trace.SEEN,
