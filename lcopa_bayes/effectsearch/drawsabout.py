@@ -15,7 +15,6 @@ import numpy as np
 from scipy.stats import chi2, truncnorm
 
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
-from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
 
@@ -70,10 +69,16 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     kept = np.delete(kept, left, axis=0)
     if state.spread is not None:
         # what internal constants of effects leave open; the model of this likelihood holds them
-        beyond = root_of(state.spread - state.optimum.covariance)
-        moved = kept + rng.standard_normal((len(kept), x.size)) @ beyond.T
+        moved = kept + rng.standard_normal(kept.shape) @ _beyond(state.spread, state.optimum.covariance).T
         kept = np.where(supported(moved)[:, None], moved, kept)
     return np.concatenate([x[None], kept])
+
+
+def _beyond(whole: Matrix, part: Matrix) -> Matrix:
+    """A factor of what one covariance has over another, (k, k); where it has less, of nothing."""
+    sd = np.sqrt(np.diag(whole))
+    power, axes = np.linalg.eigh((whole - part) / np.outer(sd, sd))
+    return np.asarray(sd[:, None] * axes * np.sqrt(np.maximum(power, 0.0)))
 
 
 def _held(optimum: Optimum, rng: np.random.Generator, count: int) -> tuple[Matrix, Matrix]:

@@ -56,6 +56,11 @@ class Verdict:
         """What the grade means for the reader."""
         return _ADVICE.get(self.grade, "")
 
+    @property
+    def reasons(self) -> list[str]:
+        """Clauses of the reason, without full stops: the first is the most severe."""
+        return self.reason.split("; ") if self.reason else []
+
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Verdict:
         """Verdict of a result; grade and reason are not repeated."""

@@ -4,6 +4,7 @@ it is not."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -106,3 +107,14 @@ def test_costs_of_several_are_those_of_each(terms: int) -> None:
     each = [regression.cost(x) for x in drawn]
     np.testing.assert_allclose(regression.costs(drawn), each, rtol=1e-9)
     assert regression.costs(drawn[:0]).shape == (0,)
+
+
+def test_what_constants_leave_open_is_added() -> None:
+    """By the covariance of the draws; where a direction has less than at the optimum nothing is taken off."""
+    state = at_optimum(1)
+    sd = np.sqrt(np.diag(state.covariance))
+    more = np.outer(sd, sd) * np.diag([3.0, *[0.0] * (sd.size - 2), -0.5])
+    drawn = likely_draws(replace(state, spread=state.covariance + more), np.random.default_rng(1), COUNT)
+    power = np.var(drawn, axis=0) / sd**2
+    assert power[0] == pytest.approx(4.0, rel=0.2)
+    assert power[1:] == pytest.approx(1.0, rel=0.2)

@@ -646,3 +646,15 @@ def test_files_of_drawings_whose_long_names_begin_alike_are_two():
     assert first.stem != second.stem
     assert max(len(first.stem), len(second.stem)) < 125
     assert drawing("a" * 110, figure, "").stem == "a" * 110
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_many_reasons_of_a_grade_are_a_list_below_the_first(tmp_path):
+    reasons = ["a contradicts b", "the noise grew", "add terms"]
+    text = page_with(tmp_path, verdict="Nothing.", grade_reason="; ".join(reasons))
+    box = text[text.index('<div class="verdict') : text.index("<nav ")]
+    assert "<p>Why this grade: a contradicts b.</p>" in box
+    assert "2 more" in box
+    assert [f"<li>{one}</li>" in box for one in reasons] == [False, True, True]
+    few = page_with(tmp_path, verdict="Nothing.", grade_reason="; ".join(reasons[:2]))
+    assert "Why this grade: a contradicts b; the noise grew." in few
