@@ -284,7 +284,7 @@ def _named(
     [nat]."""
     look = base.look or _look(base, library, rng, draws, crew)
     if look.trace.alarmed:
-        look = look.refitted(base.start, crew, rival)
+        look = look.refitted(crew, rival)
     return base._replace(look=look), look.leading if look.trace.alarmed else None
 
 
@@ -292,7 +292,7 @@ def _look(
     base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
 ) -> Round:
     quiet = base.fit.noise_samples
-    return Round(trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew))
+    return Round(base.start, trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew))
 
 
 def _explained(
@@ -300,5 +300,5 @@ def _explained(
 ) -> float:
     """Squared residual that the best named effect leaves of a base fit [response unit^2]; infinite without
     one that leaves noise."""
-    best = _look(base, library, rng, draws, crew).refitted(base.start, crew).leading
+    best = _look(base, library, rng, draws, crew).refitted(crew).leading
     return np.inf if best is None or too_smooth(best.optimum) else best.optimum.power

@@ -44,8 +44,10 @@ _PAIRS = 2
 @final
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One look at a residual."""
+    """One look at the residual of a model."""
 
+    state: State
+    """What it looks at."""
     trace: Trace
     refits: tuple[Refit, ...] = ()
     """Leading candidates with everything free, by falling evidence; none before they are refitted."""
@@ -53,11 +55,11 @@ class Round:
     """Candidates that could not be refitted, and why."""
     chosen: Refit | None = None
 
-    def refitted(self, state: State, crew: Crew, rival: float = -np.inf) -> Self:
-        """With the candidates of the state refitted, those far below a `rival` [nat] not to the end."""
+    def refitted(self, crew: Crew, rival: float = -np.inf) -> Self:
+        """With its candidates refitted, those far below a `rival` [nat] not to the end."""
         if self.refits or self.failures:
             return self
-        refits, failures = refitted(state, self.trace, crew, rival)
+        refits, failures = refitted(self.state, self.trace, crew, rival)
         return replace(self, refits=tuple(refits), failures=tuple(failures))
 
     @property
@@ -99,11 +101,9 @@ class Search:
     infinite without any."""
 
     @classmethod
-    def ending(
-        cls, rounds: Sequence[Round], start: State, state: State, groups: Mapping[str, tuple[str, ...]]
-    ) -> Self:
-        """With the state that the last round looked at."""
-        last = rounds[-1].trace
+    def ending(cls, rounds: Sequence[Round], groups: Mapping[str, tuple[str, ...]]) -> Self:
+        """With what the last round looked at."""
+        start, state, last = rounds[0].state, rounds[-1].state, rounds[-1].trace
         confounded = (groups.get(effect.name, (effect.name,)) for effect in state.model.effects)
         gained, dropped = _gained(start, state, last.scale.quiet)
         left = last.scale.drop(rounds[-1].largest) if last.alarmed else 0.0
@@ -155,51 +155,62 @@ def search(
     what remains is no noise, and one more effect takes up some of it whether or not it is there.
     """
 
-    def look_at(state: State) -> Round:
-        return Round(trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew))
+    def looking(state: State) -> Round:
+        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
+        return Round(state, seen)
 
-    state, rounds, looked = start, list[Round](), list[State]()
-    groups: dict[str, tuple[str, ...]] = {}
-    for number in range(MOST + 1):
-        looked.append(state)
-        look = first if first is not None and not number else look_at(state)
-        seen = look.trace
-        if not (seen.alarmed or state.whitening.dependence) or number == MOST:
-            rounds.append(Round(seen))
+    rounds, groups = _one_by_one(first or looking(start), looking, crew, alone=alone)
+    while rounds[-1].alarmed and len(rounds) > 1 and rounds[-2].state.model.effects:
+        if better(rounds[-1].state, rounds[-2].state):
             break
+        rounds[-2:] = [replace(rounds[-2], chosen=None)]
+    unnamed = any(effect.card.dynamics for effect in rounds[-1].state.model.effects)
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
+        rounds += _pair(rounds[0], rounds[-1].state, looking, better)
+    return Search.ending(rounds, groups)
+
+
+def _one_by_one(
+    first: Round, looking: Callable[[State], Round], crew: Crew, *, alone: bool
+) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
+    """Rounds that each add an effect but the last, and the names that each of these is confounded with."""
+    look, rounds, groups = first, list[Round](), dict[str, tuple[str, ...]]()
+    while True:
+        seen, state, number = look.trace, look.state, len(rounds)
+        if not (seen.alarmed or state.whitening.dependence) or number == MOST:
+            return [*rounds, Round(state, seen)], groups
         beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
         crew.stage(f"refitting with each effect that comes into question{beside}")
-        look = look.refitted(state, crew)
-        refits = look.refits
+        look = look.refitted(crew)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
-        likely = [one for one in accepted(refits, seen, bar) if not alone or large(one)]
-        chosen = leader(beside_dynamics(likely, [one for one in refits if one.dynamics]))
+        likely = [one for one in accepted(look.refits, seen, bar) if not alone or large(one)]
+        chosen = leader(beside_dynamics(likely, [one for one in look.refits if one.dynamics]))
         if chosen is not None and chosen.dynamics and groups:
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
         rounds.append(replace(look, chosen=chosen))
         if chosen is None:
-            break
+            return rounds, groups
         if not chosen.dynamics:
-            groups[chosen.added[0]] = group(state, chosen, refits, seen)
-        state = _kept(chosen)
-    while rounds[-1].alarmed and looked[:-1] and looked[-2].model.effects and not better(*looked[:-3:-1]):
-        looked.pop()
-        rounds.pop()
-        rounds[-1], state = replace(rounds[-1], chosen=None), looked[-1]
-    unnamed = any(effect.card.dynamics for effect in state.model.effects)
-    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
-        pair = _paired(start, state, rounds[0].trace)
-        if pair is not None:
-            look = look_at(pair.state)
-            kept: Refit | None = pair
-            if look.alarmed:
-                kept = _both(start, state, pair, better)
-                look = look if kept is pair or kept is None else look_at(kept.state)
-            if kept is not None:
-                state = kept.state
-                rounds += [Round(rounds[0].trace, (kept,), chosen=kept), look]
-    return Search.ending(rounds, start, state, groups)
+            groups[chosen.added[0]] = group(state, chosen, look.refits, seen)
+        look = looking(_kept(chosen))
+
+
+def _pair(
+    first: Round, state: State, looking: Callable[[State], Round], better: Callable[[State, State], bool]
+) -> list[Round]:
+    """Rounds that add a pair of effects at once to what the `first` looked at, where that beats a `state`
+    with effects that were found one by one; else none."""
+    pair = _paired(first.state, state, first.trace)
+    if pair is None:
+        return []
+    look, kept = looking(pair.state), pair
+    if look.alarmed:
+        both = _both(first.state, state, pair, better)
+        if both is None:
+            return []
+        look, kept = (look if both is pair else looking(both.state)), both
+    return [replace(first, refits=(kept,), failures=(), chosen=kept), look]
 
 
 def _beside_others(state: State, quiet: float) -> list[float]:

@@ -395,7 +395,7 @@ def test_an_alarm_of_the_trace_must_hold_against_the_refit():
         traced += [SimpleNamespace(name=n, log_bayes_factor=b, scatters=s) for n, b, s in others]
         seen = SimpleNamespace(traced=traced, threshold=3.2, alarmed=True)
         refit = SimpleNamespace(added=("a",), log_bayes_factor=refitted)
-        return Round(seen, (refit,), (), None).alarmed
+        return Round(None, seen, (refit,), (), None).alarmed
 
     assert alarmed(3.21)
     assert not alarmed(3.19)
