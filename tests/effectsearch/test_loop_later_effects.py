@@ -95,7 +95,11 @@ def test_numbers_of_a_model_that_does_not_follow_its_records_are_unusable(unexpl
     assert error > 20 * 0.01
     assert unexplained.grade == Grade("unusable", said)
     assert unexplained.estimate(0)["grade"] == "unusable"
-    within = [replace(one, predicted=one.observed + one.noise_sd) for one in scores]
+    tenth = [0.1 * one.observed.std() for one in scores]
+    within = [
+        replace(one, predicted=one.observed + size, noise_sd=size / 2)
+        for one, size in zip(scores, tenth, strict=True)
+    ]
     slight = [replace(one, predicted=one.observed + 0.02 * one.observed.std()) for one in scores]
     assert unfollowed(within) == unfollowed(slight) == ""
 
