@@ -36,14 +36,10 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     Coordinates that an end of their support holds are drawn on its inner side, each by itself, with the slope
     of the likelihood there: of normal draws of several of them at once none may be inside.
     """
-    x, (low, high) = state.optimum.x, state.model.bounds
-    regression = Regression(state.model, state.whitening)
-
-    def supported(many: Matrix) -> Flags:
-        return np.asarray(((many >= low) & (many <= high)).all(axis=1) & state.model.supported(many))
+    x, regression = state.optimum.x, Regression(state.model, state.whitening)
 
     def rises(many: Matrix) -> Vector:
-        inside = supported(many)
+        inside = _supported(state, many)
         out = np.full(len(many), np.inf)
         out[inside] = regression.costs(many[inside]) - state.optimum.cost
         return out
@@ -66,12 +62,22 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
         follow = rises(near) <= limit
         kept[left[follow]] = near[follow]
         left = left[~follow]
-    kept = np.delete(kept, left, axis=0)
-    if state.spread is not None:
-        # what internal constants of effects leave open; the model of this likelihood holds them
-        moved = kept + rng.standard_normal(kept.shape) @ _beyond(state.spread, state.optimum.covariance).T
-        kept = np.where(supported(moved)[:, None], moved, kept)
-    return np.concatenate([x[None], kept])
+    return np.concatenate([x[None], np.delete(kept, left, axis=0)])
+
+
+def beside_constants(state: State, drawn: Matrix, rng: np.random.Generator) -> Matrix:
+    """Draws of coordinates at internal constants of the effects that are held, moved as far as what these
+    leave open moves them; predictions have to be those of the draws themselves, at these constants."""
+    if state.spread is None:
+        return drawn
+    beyond = _beyond(state.spread, state.optimum.covariance)
+    moved = drawn + rng.standard_normal(drawn.shape) @ beyond.T
+    return np.where(_supported(state, moved)[:, None], moved, drawn)
+
+
+def _supported(state: State, many: Matrix) -> Flags:
+    low, high = state.model.bounds
+    return np.asarray(((many >= low) & (many <= high)).all(axis=1) & state.model.supported(many))
 
 
 def _beyond(whole: Matrix, part: Matrix) -> Matrix:

@@ -16,7 +16,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.drawsabout import _scales, likely_draws
+from lcopa_bayes.effectsearch.drawsabout import _scales, beside_constants, likely_draws
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.model.path import TransferPath
@@ -114,7 +114,10 @@ def test_what_constants_leave_open_is_added() -> None:
     state = at_optimum(1)
     sd = np.sqrt(np.diag(state.covariance))
     more = np.outer(sd, sd) * np.diag([3.0, *[0.0] * (sd.size - 2), -0.5])
-    drawn = likely_draws(replace(state, spread=state.covariance + more), np.random.default_rng(1), COUNT)
+    rng = np.random.default_rng(1)
+    known = likely_draws(state, rng, COUNT)
+    drawn = beside_constants(replace(state, spread=state.covariance + more), known, rng)
+    np.testing.assert_array_equal(beside_constants(state, known, rng), known)
     power = np.var(drawn, axis=0) / sd**2
     assert power[0] == pytest.approx(4.0, rel=0.2)
     assert power[1:] == pytest.approx(1.0, rel=0.2)

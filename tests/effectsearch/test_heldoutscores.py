@@ -1,5 +1,7 @@
 """Predictions of records held out by a plant with terms that the records do not need."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,3 +39,13 @@ def test_terms_too_many_do_not_lead_predictions_astray(terms: int) -> None:
     assert score.draws is not None
     left_open = NOISE * np.sqrt(base.start.optimum.x.size / base.start.whitening.size)
     assert 0.5 * left_open < np.sqrt(np.mean(score.draws**2)) < 2 * left_open
+
+
+def test_what_constants_of_effects_leave_open_moves_no_prediction() -> None:
+    """Draws are of the model with these constants; moved as others would move them they are none of it."""
+    records = (record("a", 1), record("b", 2)), (record("held", 3),)
+    base = _based(Study("ridge", None, "us", 3, *records, ModelSettings(terms=1)), 1)
+    open_too = replace(base.start, spread=100 * base.start.covariance)
+    (known,), (other,) = (held_out_scores(state, base.problem) for state in (base.start, open_too))
+    np.testing.assert_array_equal(known.predicted, other.predicted)
+    np.testing.assert_array_equal(known.variance, other.variance)
