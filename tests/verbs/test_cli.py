@@ -69,7 +69,8 @@ def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, 
     opening = f"Grade {stored['grade']}: {stored['grade_reason']}. "
     assert stored["verdict"].startswith(opening)
     assert all(
-        tied(part) in page for part in (stored["grade_reason"], stored["verdict"].removeprefix(opening))
+        tied(part) in page
+        for part in (*stored["grade_reason"].split("; "), stored["verdict"].removeprefix(opening))
     )
     code, printed, _ = run(capsys, "report", out, "--json")
     assert code == 0
