@@ -18,7 +18,7 @@ from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
 
-_CHANCE = 1e-3
+CHANCE = 1e-3
 """Probability of a draw of a normal posterior so far below its optimum that it is left out [-]."""
 _NEARER = (1.0, 0.5, 0.25)
 """Shares of its distance from the optimum at which a draw is tried [-]."""
@@ -55,7 +55,7 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     scales = _scales(lambda step, which: rises(x + step[:, None] * sides[which]), sd).reshape(-1, 2)
     z = rng.standard_normal((count, free.size))
     shift += (np.where(z < 0, scales[:, 0], scales[:, 1]) * z) @ onto
-    limit = float(chi2.isf(_CHANCE, x.size)) / 2
+    limit = float(chi2.isf(CHANCE, x.size)) / 2
     kept, left = np.full((count, x.size), np.nan), np.arange(count)
     for share in _NEARER:
         near = x + share * shift[left]

@@ -7,11 +7,13 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.drawsabout import CHANCE
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -162,12 +164,17 @@ def _values(posterior: Posterior, known: Mapping[str, float]) -> Vector:
 
 
 def normal_draws(posterior: Posterior, optimum: Optimum, seed: int) -> Draws | None:
-    """Normal draws about an optimum inside the prior; None where there are none."""
+    """Normal draws about an optimum inside the prior that follow the records; None with fewer than two.
+
+    Along a ridge most normal draws are plants that the records reject, and predict others badly wherever the
+    posterior is.
+    """
     rng = np.random.default_rng([seed, _STREAM])
     centre, root = posterior.coordinates(optimum.values[None]), root_of(optimum.covariance)
     z = centre + rng.standard_normal((_DRAWS, len(root))) @ root.T
-    z = z[posterior.log_prior(z) > -np.inf]
-    if not len(z):
+    z = np.vstack([centre, z[posterior.log_prior(z) > -np.inf]])
+    z = z[posterior.log_density(z) >= optimum.log_density - chi2.isf(CHANCE, len(root)) / 2]
+    if len(z) < 2:
         return None
     values = posterior.complete(z, rng)[None]
     return Draws(posterior.table, values, np.zeros(values.shape[:2]), (), float(len(z)))

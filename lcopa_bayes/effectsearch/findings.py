@@ -11,8 +11,7 @@ import numpy as np
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.explained import coordinates_of
 from lcopa_bayes.effectsearch.heldouteffects import missed, share_beyond_noise, unseen_share
-from lcopa_bayes.effectsearch.heldoutscores import held_out_scores
-from lcopa_bayes.effectsearch.leavingout import left_out_scores
+from lcopa_bayes.effectsearch.heldoutscores import unseen_scores
 from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.outliers import Outlying, without_outliers
 from lcopa_bayes.effectsearch.rounds import Search
@@ -55,7 +54,7 @@ class Side:
     @classmethod
     def of(cls, problem: Problem, state: State) -> Self:
         """Those of a state."""
-        unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
+        unseen = unseen_scores(state, problem)
         log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
         return cls(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)
 
@@ -76,7 +75,7 @@ class Side:
 def predicts_better(problem: Problem, larger: State, smaller: State) -> bool:
     """Whether a model takes a part of the squared error beyond noise that one with fewer effects leaves on
     unseen records, where that leaves any."""
-    was, now = (Side.of(problem, state).unseen for state in (smaller, larger))
+    was, now = (unseen_scores(state, problem) for state in (smaller, larger))
     return not share_beyond_noise(problem.study, was, now, larger) > CONFIRMED
 
 
@@ -138,8 +137,8 @@ def unfollowed(fit: Sequence[Score]) -> str:
     for axis in sorted({one.axis for one in fit}):
         own = [one for one in fit if one.axis == axis]
         error = pooled_rmse(own, axis)
-        apart = np.concatenate([one.observed - one.observed.mean() for one in own])
-        above, share = error / own[0].noise_sd, error / (float(np.sqrt(np.mean(apart**2))) or np.inf)
+        varied = np.concatenate([one.observed - one.observed.mean() for one in own])
+        above, share = error / own[0].noise_sd, error / (float(np.sqrt(np.mean(varied**2))) or np.inf)
         if above > _UNFOLLOWED[0] and share > max(worst, _UNFOLLOWED[1]):
             worst = share
             said = (

@@ -1,4 +1,5 @@
-"""Errors on records held out, predicted as a fit predicts them: by draws, with levels by its rule."""
+"""Errors on unseen records: on those held out, predicted as a fit predicts them, by draws and with levels by
+its rule, or with fitted ones left out in turn."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.effectsearch.drawsabout import likely_draws
+from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.scores import Score, State, score_of
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
@@ -22,6 +24,12 @@ _DRAWS = 100
 _MOST = 400
 """The same of a sampled posterior, at most [-]."""
 _STREAM = 14
+"""Mark of their randomness."""
+
+
+def unseen_scores(state: State, problem: Problem) -> list[Score]:
+    """On the study's held-out records; without any with each fit record left out in turn."""
+    return held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
 
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:

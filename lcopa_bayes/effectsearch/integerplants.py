@@ -15,9 +15,8 @@ from typing import final
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.heldoutscores import held_out_scores
+from lcopa_bayes.effectsearch.heldoutscores import unseen_scores
 from lcopa_bayes.effectsearch.lags import linear
-from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.lesseffects import descended_with_effects, following, less_effects
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
@@ -75,9 +74,7 @@ class IntegerPlant:
     def unseen(self) -> float:
         """Largest root mean square error of any axis on unseen records over the noise [-]."""
         state = self.plant.state
-        held_out = self.problem.study.held_out
-        unseen = held_out_scores(state, self.problem) if held_out else left_out_scores(state)
-        return over_noise(fit_scores(state), unseen, clear=True)
+        return over_noise(fit_scores(state), unseen_scores(state, self.problem), clear=True)
 
     @property
     def said(self) -> str:

@@ -128,18 +128,19 @@ class Loop:
         own = Grade(
             "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
         )
-        return self._limited(own if self.draws is None else self.draws.grade)
+        return Grade.worst((own if self.draws is None else self.draws.grade, self._limit))
 
-    def _limited(self, own: Grade) -> Grade:
-        """A grade, or that of any number of this loop, however well it was sampled, if it is worse."""
+    @cached_property
+    def _limit(self) -> Grade:
+        """The best grade of any number of this loop, however well it was sampled."""
         said = unfollowed(self.after.fit)
         if said:
-            return Grade.worst((own, Grade("unusable", said)))
+            return Grade("unusable", said)
         if self.verdict.confidence == "tentative":
             said = "the verdict that they rest on is tentative"
         elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
             said = "the records hold something that the model they are of does not explain"
-        return Grade.worst((own, Grade("tentative", f"the draws are reliable, but {said}"))) if said else own
+        return Grade("tentative", f"the draws are reliable, but {said}") if said else Grade("reliable", "")
 
     def estimate(self, k: int) -> dict[str, Any]:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
@@ -151,7 +152,7 @@ class Loop:
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
         ess = ess_with_lags(own.ess, self.lags)
-        grade = self._limited(Grade(cast("Level", own.grade), "")).level
+        grade = Grade.worst((Grade(cast("Level", own.grade), ""), self._limit)).level
         return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:

@@ -68,16 +68,16 @@ def spoiled(record: Record, how: str, size: int, scales: tuple[float, float, flo
     time_scale, drive_scale, response_scale = scales
     drive, response = record.drive[rows] * drive_scale, record.response[rows] * response_scale
     rng = np.random.default_rng([rows.size, SPOILINGS.index(how)])
-    middle = np.nan_to_num(np.nanmean(response, axis=0)) if np.isfinite(response).any() else 0.0
-    spread = float(np.nanstd(response)) if np.isfinite(response).any() else 0.0
+    seen = np.ma.masked_invalid(response)
     if how == "half of it missing":
         response[rng.random(response.shape) < 0.5] = np.nan
     elif how == "coarse":
+        spread = float(seen.compressed().std()) if seen.count() else 0.0
         response = np.round(response / (spread or 1.0)) * spread
     elif how == "no noise":
         response = _followed(drive)[:, [0] * response.shape[1]] * response_scale
     elif how == "constant":
-        response = np.where(np.isfinite(response), middle, np.nan)
+        response = np.where(seen.mask, np.nan, seen.mean(axis=0).filled(0.0))
     elif how == "spikes":
         response[rng.integers(len(response))] *= 1e3
     elif how == "drive never moves":
@@ -125,9 +125,8 @@ def study(seed: int) -> tuple[Study, dict[str, Any]]:
     return replace(own, fit=fit, held_out=held_out, model=model), said
 
 
-def play(shared: tuple[int, Path], seed: int) -> dict[str, Any]:
-    """What came of one campaign."""
-    limit, _ = shared
+def play(limit: int, seed: int) -> dict[str, Any]:
+    """What came of one campaign within `limit` [CPU s]."""
     began, row = time.process_time(), {"seed": seed}
     signal.signal(signal.SIGPROF, _too_long)
     try:
@@ -188,7 +187,7 @@ def main() -> int:
     kept = {seed: folder / f"{seed}.json" for seed in seeds}
     rows = [json.loads(file.read_text(encoding="utf-8")) for file in kept.values() if file.exists()]
     missing = [seed for seed, file in kept.items() if not file.exists()]
-    with workers((given.limit, folder), jobs=given.jobs) as crew:
+    with workers(given.limit, jobs=given.jobs) as crew:
         for row in tqdm(crew.finished(play, missing), total=len(missing), disable=given.quiet):
             write_text(kept[row["seed"]], json.dumps(row) + "\n")
             rows.append(row)

@@ -10,6 +10,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import _based
 from lcopa_bayes.effectsearch.heldoutscores import held_out_scores
+from lcopa_bayes.effectsearch.loop import loop
 
 PERIOD, FREQUENCY, DAMPING, NOISE = 0.2, 1.1, 0.08, 0.03
 
@@ -49,3 +50,12 @@ def test_what_constants_of_effects_leave_open_moves_no_prediction() -> None:
     (known,), (other,) = (held_out_scores(state, base.problem) for state in (base.start, open_too))
     np.testing.assert_array_equal(known.predicted, other.predicted)
     np.testing.assert_array_equal(known.variance, other.variance)
+
+
+def test_draws_along_a_ridge_are_used() -> None:
+    """They predict the record held out as the optimum does, and normal draws about it do not."""
+    records = (record("a", 1), record("b", 2)), (record("held", 3),)
+    found = loop(Study("ridge", None, "us", 3, *records, ModelSettings(terms=2)), as_stated=True, quick=True)
+    assert found.draws is not None
+    assert found.cautions == ()
+    assert found.after.unseen[0].rmse == pytest.approx(NOISE, rel=0.15)

@@ -452,7 +452,7 @@ def test_the_error_that_has_risen_is_that_of_the_worst_axis(clean):
 
 def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypatch):
     """As of another mode: the error after a loop is never above that before it."""
-    scores = findings.held_out_scores
+    scores = findings.unseen_scores
 
     def away(state, problem):
         made = scores(replace(state, sampled=None), problem)
@@ -464,7 +464,7 @@ def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypat
     monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: ("draws", None))
     for module in (loops, findings):
         monkeypatch.setattr(module, "coordinates_of", around)
-    monkeypatch.setattr(findings, "held_out_scores", away)
+    monkeypatch.setattr(findings, "unseen_scores", away)
     found = loop(study(1), library=LIBRARY, quick=True, as_stated=True)
     assert found.draws is None
     assert any("are not used" in caution for caution in found.cautions)

@@ -29,8 +29,8 @@ def test_spoiled_records_have_the_size_and_the_units_that_are_asked_for():
     assert np.nanmax(np.ptp(np.nan_to_num(flat.response, nan=flat.response[0, 0]), axis=0)) == 0
 
 
-def test_a_campaign_ends_in_a_result(tmp_path):
-    row = spoiled.play((120, tmp_path), 405)
+def test_a_campaign_ends_in_a_result():
+    row = spoiled.play(120, 405)
     assert row["outcome"] in {*spoiled.OUTCOMES} - {"not in time", "refused"}
     assert row["cpu_seconds"] > 0
 
@@ -45,7 +45,7 @@ def test_a_campaign_ends_in_a_result(tmp_path):
         ("odd", "crashed"),
     ],
 )
-def test_what_counts_as_a_crash(tmp_path, monkeypatch, raised, outcome):
+def test_what_counts_as_a_crash(monkeypatch, raised, outcome):
     def loop(*given, **options):
         if isinstance(raised, str):
             warnings.warn(raised, RuntimeWarning, stacklevel=1)
@@ -54,7 +54,7 @@ def test_what_counts_as_a_crash(tmp_path, monkeypatch, raised, outcome):
         return SimpleNamespace(values={"verdict": "clean"}, summary=lambda: None)
 
     monkeypatch.setattr(spoiled, "loop", loop)
-    row = spoiled.play((120, tmp_path), 405)
+    row = spoiled.play(120, 405)
     assert row["outcome"] == outcome
     text = spoiled.page([row], "command", 120)
     counts = [cell.strip() for cell in text.splitlines()[-3 if outcome == "crashed" else -2].split("|")]
