@@ -11,7 +11,7 @@ from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
 from lcopa_bayes.effectsearch.findings import Side
 from lcopa_bayes.effectsearch.lags import ess_with_lags
 from lcopa_bayes.effectsearch.leavingout import in_turn
-from lcopa_bayes.effectsearch.loop import Loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse

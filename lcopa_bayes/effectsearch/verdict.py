@@ -51,6 +51,11 @@ class Verdict:
         """Whether something remains that nothing explains."""
         return self.kind in ("unexplained", "partly explained")
 
+    @property
+    def names(self) -> bool:
+        """Whether its model has effects."""
+        return self.kind in ("explained", "partly explained", "disturbance")
+
 
 @final
 @dataclass(frozen=True)

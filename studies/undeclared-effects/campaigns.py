@@ -18,7 +18,8 @@ from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.findings import Side
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.scores import pooled_coverage
 from lcopa_bayes.results.structure import with_least_terms
 

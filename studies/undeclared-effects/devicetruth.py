@@ -16,7 +16,7 @@ from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.bench.undeclared import LARGEST, Campaign, shot_of
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.effectsearch.findings import Side
-from lcopa_bayes.effectsearch.loop import Loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.openeffects import Weighed, mixture
 from lcopa_bayes.model.path import TransferPath
 

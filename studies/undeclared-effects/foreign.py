@@ -17,7 +17,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import quantile
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.loop import Loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.model.path import TransferPath
 
 SHAPES = ((1, 1), (1, 2), (2, 1), (2, 2), (3, 2))

@@ -23,7 +23,8 @@ from lcopa_bayes.effectsearch.explained import (
     explained_draws,
     explained_study,
 )
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of

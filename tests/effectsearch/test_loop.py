@@ -462,8 +462,7 @@ def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypat
         return np.random.default_rng(0).normal(size=(50, len(model.names)))
 
     monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: ("draws", None))
-    for module in (loops, findings):
-        monkeypatch.setattr(module, "coordinates_of", around)
+    monkeypatch.setattr(findings, "coordinates_of", around)
     monkeypatch.setattr(findings, "unseen_scores", away)
     found = loop(study(1), library=LIBRARY, quick=True, as_stated=True)
     assert found.draws is None

@@ -10,7 +10,8 @@ import pytest
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.summary import results
 
 NOISE = 0.05

@@ -12,7 +12,8 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.findings import predicts_better, unfollowed
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.rounds import search
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.sampling.convergence import Grade

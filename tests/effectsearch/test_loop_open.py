@@ -12,7 +12,8 @@ from test_loop_unseen import fitted
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results

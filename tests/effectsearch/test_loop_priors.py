@@ -14,7 +14,8 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch import basemodel, noise, priorwidth, refits, signature
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.inference.assembly import problem_of

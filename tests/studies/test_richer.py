@@ -16,7 +16,8 @@ from foreign import campaign, truths
 from lcopa_bayes.core.estimate import quantile
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch import richerplants
-from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.results.structure import with_least_terms
 

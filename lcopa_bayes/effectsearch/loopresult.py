@@ -1,0 +1,156 @@
+"""What a loop ends with: a model, its verdict, and every number over all that the records leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, cast, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.agreement import Disagreement
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basefit import BaseFit
+from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
+from lcopa_bayes.effectsearch.findings import Side, unfollowed
+from lcopa_bayes.effectsearch.lags import ess_with_lags, figures_with_lags, number_with_lags
+from lcopa_bayes.effectsearch.openeffects import Alternative, Weighed, mixture, step_figures
+from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
+from lcopa_bayes.effectsearch.outliers import Outlying
+from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
+from lcopa_bayes.effectsearch.rounds import Round
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.trace import Trace
+from lcopa_bayes.effectsearch.verdict import Verdict
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
+from lcopa_bayes.sampling.convergence import Grade, Level
+from lcopa_bayes.sampling.draws import Draws
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What the loop found in a study."""
+
+    problem: Problem
+    base: BaseFit
+    enlarged: str
+    """What was changed in the base model before anything was traced; empty when nothing was."""
+    rounds: tuple[Round, ...]
+    effects: tuple[Effect, ...]
+    """Effects of the final model, perhaps linear dynamics without a name among them; none when the verdict is
+    `unexplained` or `clean`."""
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect, the names it is confounded with, its own first."""
+    verdict: Verdict
+    before: Side
+    after: Side
+    left_out: bool
+    """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
+
+    cautions: tuple[str, ...] = ()
+    """What limits the verdict."""
+    draws: Draws | None = None
+    """Draws of the explained study; None when none were asked for, or none could be had."""
+    outliers: Outlying | None = None
+    """Samples left out before anything was traced; None without any."""
+    contrary: tuple[Disagreement, ...] = ()
+    """Records that disagree."""
+    loose: State | None = None
+    """The final model under the noise that its residual has, where something significant remains and nothing
+    was sampled; None elsewhere. Measured noise would give intervals of a plant known to be another."""
+    open: tuple[Alternative, ...] = ()
+    """Effects that the records leave open beside, or in place of, those of the final model."""
+    lags: tuple[SumOfLags, ...] = ()
+    """Sums of lags beside the plant of the final model, where the search chose its structure."""
+    plants: PlantsBeside = field(default_factory=PlantsBeside)
+    """Plants beside that of the final model, where the search chose its structure."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is named: the effects, and outliers."""
+        named = (effect.name for effect in self.effects if not effect.card.dynamics)
+        return (*named, *([OUTLIERS] if self.outliers else []))
+
+    @property
+    def grade(self) -> Grade:
+        """How far the numbers can be trusted: as far as verdict and model, and without draws no further
+        than a Laplace approximation."""
+        own = Grade(
+            "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
+        )
+        return Grade.worst((own if self.draws is None else self.draws.grade, self._limit))
+
+    @cached_property
+    def _limit(self) -> Grade:
+        """The best grade of any number of this loop, however well it was sampled."""
+        said = unfollowed(self.after.fit)
+        if said:
+            return Grade("unusable", said)
+        if self.verdict.confidence == "tentative":
+            said = "the verdict that they rest on is tentative"
+        elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
+            said = "the records hold something that the model they are of does not explain"
+        return Grade("tentative", f"the draws are reliable, but {said}") if said else Grade("reliable", "")
+
+    def estimate(self, k: int) -> dict[str, Any]:
+        """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
+        its standard deviations by noise and by structure, and lower end, median and upper end under the final
+        model `alone`."""
+        here = self.number(k)
+        if self.draws is None:
+            return here.as_json(ess=np.nan, grade=self.grade.level, interval="Laplace")
+        own = next(one for one in self.draws.estimates() if one.name == here.name)
+        alone = own.lower, own.value, own.upper
+        ess = ess_with_lags(own.ess, self.lags)
+        grade = Grade.worst((Grade(cast("Level", own.grade), ""), self._limit)).level
+        return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
+
+    def number(self, k: int) -> Weighed:
+        """A coordinate [`unit`] over the final model and each that is open to it and has it."""
+        state = self.after.state
+        row = state.model.posterior.table.rows[state.model.columns[k]]
+        pairs = zip(*self._mixture, strict=True)
+        own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
+        shares = np.array([weight for _, weight in own])
+        number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+        number = self.plants.number(number, row)
+        return number_with_lags(number, row, self.lags, state.model.plant.table.layout)
+
+    @cached_property
+    def figures(self) -> tuple[Weighed, ...]:
+        """Figures of the plant's response to a unit step over the longest record, its effects aside, over the
+        same models."""
+        own, layout = (self.figures_of(self.after.state, *self._mixture), self.problem.posterior.table.layout)
+        span, unit = self.problem.scales.span, self.problem.study.time_unit
+        own = self.plants.figures(own, span=span, time_unit=unit)
+        return figures_with_lags(own, self.lags, layout, span=span, time_unit=unit)
+
+    def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
+        """The same of any `mixture`."""
+        span, unit = self.problem.scales.span, self.problem.study.time_unit
+        return step_figures(state, parts, weights, span=span, time_unit=unit)
+
+    @cached_property
+    def _mixture(self) -> tuple[list[Matrix], Vector]:
+        state = self.after.state
+        if self.draws is None:
+            return mixture(self.loose or state, None, self.open)
+        beyond = [one for one in self.open if not one.within(self.draws.table)]
+        return mixture(state, coordinates_of(state.model, self.draws), beyond)
+
+    @property
+    def study(self) -> Study:
+        """The study with the effects that were found declared, outliers among them: what a fit, an audit or a
+        comparison takes."""
+        return explained_study(self.problem.study, self.after.state.model, self.outliers)
+
+    @property
+    def trace(self) -> Trace | None:
+        """Evidence of every effect in the first residual; None when the base fit failed, or no plant follows
+        the records as they are."""
+        return self.rounds[0].trace if self.rounds else None
