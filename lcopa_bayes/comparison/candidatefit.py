@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import log
 from pathlib import Path
 from typing import Any, final
@@ -188,7 +189,7 @@ class Contender:
         if self.rejected:
             sampler = replace(self.candidate.study.sampler, target_ess=_REJECTED_ESS)
             study = replace(self.candidate.study, sampler=sampler)
-            fitted = fit(study, quick=self.quick, around_optima=True)
+            fitted = fit(study, quick=self.quick, around_optima=True, budget=BUDGET)
             return replace(fitted, draws=fitted.draws.limited((_ROUGHLY,)))
         fitted = self._fitted(self.candidate.study, self.folder)
         useless = fitted.draws.grade.level == "unusable" and fitted.run.stopped_after is None
@@ -222,7 +223,8 @@ class Contender:
             save_json(entries, self.folder / CARD)
 
     def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
-        return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True, starts=starts)
+        own = partial(fit, folder=folder, resume=self.resume, quick=self.quick)
+        return own(study, starts=starts, budget=BUDGET)
 
 
 _ROUGHLY = Limitation(
@@ -243,22 +245,17 @@ def laplace(problem: Problem) -> float:
     return float(logsumexp(levels)) + problem.posterior.table.log_permutations if levels else -np.inf
 
 
-def contender(
-    candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool, budget: float = BUDGET
-) -> Contender:
-    """A candidate with fewer walkers than a fit has and a `budget` of time for its draws [s]; what the
-    study's ``[sampler]`` states is kept.
+def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
+    """A candidate with fewer walkers than a fit has; what the study's ``[sampler]`` states is kept.
 
     Where the short plan leaves a posterior that is unusable, before its budget ends, it is sampled again as a
     fit would.
     """
-    study = candidate.study
-    own = replace(study.sampler, seconds=study.sampler.seconds or budget)
+    own = candidate.study.sampler
     sampler = replace(own, walkers=own.walkers or WALKERS)
     # the study file may name candidates that say nothing of this one
-    return Contender(
-        replace(candidate, study=replace(study, sampler=sampler, inputs={})), own, folder, quick, resume
-    )
+    study = replace(candidate.study, sampler=sampler, inputs={})
+    return Contender(replace(candidate, study=study), own, folder, quick, resume)
 
 
 def card(

@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.averaging import Gain, averaged, by_prediction, stretches, total_sd
-from lcopa_bayes.comparison.candidatefit import BUDGET, REJECTED, Contender, contender
+from lcopa_bayes.comparison.candidatefit import REJECTED, Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.decision import decided
@@ -28,7 +28,6 @@ from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results.fit import CONTRARY
 
 _ROUNDS = 2_000
 _SETTLED = 1e-10
@@ -174,11 +173,10 @@ def compare(
     problems = _problems(candidates)
     refuse_if(problems)
     place = None if folder is None else writable_folder(folder).resolve() / "candidates"
-    budget = CONTRARY if candidates[0].study.contradictory else BUDGET  # all are of the same records
     tasks = []
     for one in candidates:
         own = None if place is None else writable_folder(place / folder_name(one.name))
-        tasks.append(contender(one, own, quick=quick, resume=resume, budget=budget))
+        tasks.append(contender(one, own, quick=quick, resume=resume))
     cards: dict[str, Mapping[str, Any]] = {}
     with Progress(total=len(tasks), unit="candidate", quiet=quiet, desc="comparing") as bar:
         with workers(None, jobs=min(jobs, len(tasks))) as crew:

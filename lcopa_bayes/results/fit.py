@@ -30,6 +30,7 @@ from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.residuals import Residual, residuals
+from lcopa_bayes.results.resonances import is_disturbance
 from lcopa_bayes.results.result import PAGE, write_fit_page
 from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
@@ -54,8 +55,9 @@ if TYPE_CHECKING:
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
-CONTRARY = 30.0
-"""Time for draws where records contradict each other grossly, which make no number usable [s]."""
+HOPELESS = 30.0
+"""Time for draws where no number will be usable, because records contradict each other grossly or the plant
+at its optimum is a periodic disturbance, and the study states none [s]."""
 
 
 @final
@@ -181,13 +183,16 @@ def fit(
     starts: Matrix | None = None,
     searched: tuple[Problem, tuple[Optimum, ...]] | None = None,
     around_optima: bool = False,
+    budget: float | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
     `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
     with effects where the method is "auto", and any `around_optima`, is sampled by importance around its
     optima (`weightedrun`), which searches for no other modes, where its weights hold. The study prepared and
-    its optima, where it has been `searched` (`firstlook`) or its structure chosen, spare that search.
+    its optima, where it has been `searched` (`firstlook`) or its structure chosen, spare that search. A
+    `budget` is the time for draws where the study states none [s]; by default it is not limited, unless
+    nothing that is drawn will be usable (`HOPELESS`).
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -204,7 +209,8 @@ def fit(
     problem = searched[0] if searched else problem_of(study)
     if folder:
         writable_folder(folder)
-    plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
+    weighted_result, optima = None, tuple[Optimum, ...]()
+    plan = plan_of(problem, quick=quick, budget=budget)
     if around_optima or (problem.posterior.simulation is not None and plan.method == "auto"):
         problem, begun = weighted_start(problem, quick=quick)
         begin = monotonic()
@@ -213,6 +219,8 @@ def fit(
             plan = replace(plan, seconds=max(begin + plan.seconds - monotonic(), 0.0))
     else:
         problem, optima = resolved_optima(problem, searched[1] if searched else optima_of(problem))
+        if study.sampler.seconds is None and optima and is_disturbance(problem, optima[0]):
+            plan = replace(plan, seconds=HOPELESS if budget is None else min(HOPELESS, budget))
     if weighted_result is not None:
         run, draws = weighted_result
     else:
@@ -308,14 +316,15 @@ def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Opt
     return resolved_optima(problem, optima_of(problem, starts=QUICK_STARTS if quick else STARTS))
 
 
-def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
-    """The sampling plan of a study; with little time for records that no plant follows, unless it states
-    any."""
-    wanted, study = problem.study.sampler, problem.study
-    seconds = CONTRARY if wanted.seconds is None and study.contradictory else wanted.seconds
+def plan_of(problem: Problem, *, quick: bool, budget: float | None = None) -> SamplePlan:
+    """The sampling plan of a study, with a `budget` of time [s], unless it states any; a small one where no
+    plant follows the records."""
+    wanted, seconds = problem.study.sampler, problem.study.sampler.seconds
+    if seconds is None:
+        seconds = HOPELESS if problem.study.contradictory else budget
     plan = SamplePlan.of(
         problem.posterior.dimension,
-        seed=study.seed,
+        seed=problem.study.seed,
         ensembles=wanted.ensembles,
         walkers=wanted.walkers,
         steps=wanted.steps,

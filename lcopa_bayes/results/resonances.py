@@ -16,6 +16,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.powerseries import denominator
 from lcopa_bayes.results.prediction import responses
@@ -113,6 +114,12 @@ def resonances(problem: Problem, draws: Draws) -> Iterator[Limitation]:
             "sample faster, keep the priors of the times above the sampling period, hold out a record, or "
             "let `loop` trace the disturbance",
         )
+
+
+def is_disturbance(problem: Problem, optimum: Optimum) -> bool:
+    """Whether the plant at an optimum describes a disturbance, so that no draws about it are usable."""
+    values = optimum.values[None, None]
+    return bool(unresolved(problem, Draws(problem.posterior.table, values, np.zeros((1, 1)), (), 1.0)))
 
 
 def ringing_confirmed(problem: Problem, draws: Draws, element: int) -> float:

@@ -13,7 +13,7 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.comparison.candidatefit import BUDGET, Contender, contender
+from lcopa_bayes.comparison.candidatefit import BUDGET, contender
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.errors import InputError
@@ -24,7 +24,8 @@ from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.report.compare import drawn
 from lcopa_bayes.report.pages import write_page_of
-from lcopa_bayes.results.fit import CONTRARY, plan_of
+from lcopa_bayes.results.fit import HOPELESS, plan_of
+from lcopa_bayes.sampling.run import SamplePlan
 
 FEW = {"target_ess": 100}
 PICK = ("fractional-1", "first-order")
@@ -235,26 +236,23 @@ def test_a_comparison_samples_as_a_fit_does():
         assert compared.steps == own.steps
 
 
-@pytest.mark.parametrize(("sampler", "budget"), [({}, BUDGET), ({"seconds": 7.0}, 7.0)])
-def test_candidates_have_a_budget_of_time_that_a_study_may_state(sampler, budget):
-    (one, *_) = candidates_of(study(record(), sampler=sampler), pick=PICK)
-    made = contender(one, None, quick=False, resume=False)
-    assert (made.candidate.study.sampler.seconds, made.patient.seconds) == (budget, budget)
+@pytest.mark.parametrize(
+    ("contrary", "sampler", "seconds"),
+    [(False, {}, BUDGET), (True, {}, HOPELESS), (True, {"seconds": 7.0}, 7.0)],
+)
+def test_candidates_have_a_budget_of_time(monkeypatch, contrary, sampler, seconds):
+    """That of the study where it states any, and little where no plant follows the records."""
+    (one, *_), plans = candidates_of(study(record(), sampler=sampler), pick=PICK), []
 
-
-@pytest.mark.parametrize(("contrary", "budget"), [(False, BUDGET), (True, CONTRARY)])
-def test_records_that_no_plant_follows_have_little_time(monkeypatch, contrary, budget):
-    candidates, given = candidates_of(study(record()), pick=PICK), []
-
-    def noted(*_: object, budget: float, **__: object) -> Contender:
-        given.append(budget)
+    def noted(posterior: object, plan: SamplePlan, **_: object) -> None:
+        plans.append(plan)
         raise InputError("enough is known")
 
     monkeypatch.setattr(Study, "contradictory", contrary)
-    monkeypatch.setattr("lcopa_bayes.comparison.compare.contender", noted)
+    monkeypatch.setattr("lcopa_bayes.results.fit.sample", noted)
     with pytest.raises(InputError, match="enough is known"):
-        compare(candidates)
-    assert given == [budget]
+        contender(one, None, quick=False, resume=False)()
+    assert [plan.seconds for plan in plans] == [seconds]
 
 
 # -- measured records ------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,12 @@ from small import TRUTH, record, study
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results.fit import Fit, fit, plan_of
+from lcopa_bayes.results.fit import HOPELESS, Fit, fit, plan_of
 from lcopa_bayes.results.runfolder import commanded, fingerprint, provenance
 from lcopa_bayes.results.summary import residual_rms, results, verdict
+from lcopa_bayes.sampling.run import SamplePlan
+
+fits = sys.modules[fit.__module__]
 
 TINY = {"ensembles": 2, "walkers": 32, "steps": 300, "thin": 3, "target_ess": 200}
 BRIEF = TINY | {"walkers": 12, "steps": 60}
@@ -169,6 +173,32 @@ def test_records_that_no_plant_follows_are_sampled_for_half_a_minute():
     assert plan_of(problem_of(contrary), quick=False).seconds == 30.0
     stated = study(on, wrong, sampler={"seconds": 900.0})
     assert plan_of(problem_of(stated), quick=False).seconds == 900.0
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "stated", "budget", "seconds"),
+    [
+        (False, {}, None, None),
+        (False, {}, 240.0, 240.0),
+        (True, {}, None, HOPELESS),
+        (True, {}, 240.0, HOPELESS),
+        (True, {}, 7.0, 7.0),
+        (True, {"seconds": 900.0}, 240.0, 900.0),
+    ],
+)
+def test_a_disturbance_has_little_time_for_draws(monkeypatch, disturbance, stated, budget, seconds):
+    """None of its numbers is usable, however long they are sampled."""
+    plans: list[SamplePlan] = []
+
+    def noted(posterior: object, plan: SamplePlan, **_: object) -> None:
+        plans.append(plan)
+        raise InputError("enough is known")
+
+    monkeypatch.setattr(fits, "is_disturbance", lambda *_: disturbance)
+    monkeypatch.setattr(fits, "sample", noted)
+    with pytest.raises(InputError, match="enough is known"):
+        fit(study(record(), sampler=stated), budget=budget)
+    assert [plan.seconds for plan in plans] == [seconds]
 
 
 def test_too_few_samples_and_nothing_to_sample_are_refused():

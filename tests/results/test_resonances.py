@@ -10,7 +10,14 @@ from small import draws_of, problem, ringing
 
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.results.resonances import CONFIRMED, resonances, ringing_confirmed, unresolved
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.results.resonances import (
+    CONFIRMED,
+    is_disturbance,
+    resonances,
+    ringing_confirmed,
+    unresolved,
+)
 from lcopa_bayes.sampling.draws import Draws
 
 TIME, ORDER, DELAY = 0.4, 1.97, 2.2
@@ -37,6 +44,14 @@ def test_without_held_out_records_nothing_confirms_it():
     assert np.isnan(ringing_confirmed(made, draws, 0))
     (limitation,) = resonances(made, draws)
     assert limitation.level == "unusable"
+
+
+def test_an_optimum_is_a_disturbance_as_its_draws_are():
+    held = replace(ringing(TIME, ORDER, DELAY, seed=2)[0], name="held")
+    for records, disturbance in (((), True), ((held,), False)):
+        made, draws = known(*records)
+        optimum = Optimum(draws.flat[0], np.eye(made.posterior.dimension), 0.0)
+        assert is_disturbance(made, optimum) == disturbance
 
 
 def test_a_sinusoid_that_follows_no_drive_does_not():
