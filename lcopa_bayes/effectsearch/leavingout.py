@@ -16,7 +16,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.covariance import root_of
+from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.effectsearch.regression import GAIN, Optimum, Regression
 from lcopa_bayes.effectsearch.scores import Score, State, level_of, own_levels_of, scores_of
 from lcopa_bayes.effectsearch.whitening import Part, Whitening
@@ -64,7 +64,7 @@ def log_scores(optimum: Optimum, chosen: Sequence[Index]) -> Vector:
     for rows in chosen:
         residual = optimum.settled[rows]
         rest, pull = _less(optimum, rows, residual)
-        power = residual @ residual + pull @ np.linalg.solve(rest, pull)
+        power = residual @ residual + pull @ covariance_of(rest) @ pull
         out.append(-0.5 * power + 0.5 * (np.linalg.slogdet(rest)[1] - whole))
     return np.array(out)
 
@@ -112,7 +112,7 @@ def _predicted(state: State, rows: Index) -> _Predicted:
     several records with effects, each of which would take as long as a refit does."""
     optimum = state.optimum
     rest, pull = _less(optimum, rows, optimum.settled[rows])
-    covariance: Matrix = np.linalg.inv(rest).astype(float)
+    covariance = covariance_of(rest)
     step = -covariance @ pull
     mean, slopes = state.fitted[rows] + optimum.tangents[rows] @ step, optimum.tangents[rows]
     affordable = len(state.whitening.samples) == 1 or not state.model.effects
@@ -121,7 +121,7 @@ def _predicted(state: State, rows: Index) -> _Predicted:
         end = descended(_Others(regression, rows), optimum.x[None], steps=_STEPS, least=GAIN)
         predicted, tangents = state.model.tangents(end.points[0])
         mean, slopes = predicted[rows], tangents[rows]
-        covariance = np.linalg.inv(end.information[0]).astype(float)
+        covariance = covariance_of(end.information[0])
     return _Predicted(mean, slopes, covariance)
 
 

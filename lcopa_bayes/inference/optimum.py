@@ -21,6 +21,7 @@ from lcopa_bayes.inference.pathstarts import beside_each_other
 from lcopa_bayes.inference.plantdescents import PlantDescents
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior, portions
+from lcopa_bayes.inference.precision import refuse_unresolved
 from lcopa_bayes.inference.spareterms import beside_spare_terms
 from lcopa_bayes.model.effects.effect import UnstableError
 
@@ -83,7 +84,8 @@ def find_optima(
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
-    best optima are the starts (`with_effects`).
+    best optima are the starts (`with_effects`). InputError where no plant is likely enough for numbers of
+    double precision (`precision`).
     """
     table = posterior.table
     if posterior.simulation is not None:
@@ -110,6 +112,8 @@ def find_optima(
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
+    if found:
+        refuse_unresolved(posterior, found[0].values, found[0].log_density)
     spare = beside_spare_terms(posterior, np.array(_weighty(found))) if found else []
     if spare:
         found = _kept(posterior, [*found, *_descended(posterior, spare, crew=crew)])
@@ -189,7 +193,7 @@ def again(
 def _weighty(optima: Sequence[Optimum]) -> list[Vector]:
     """Table values of optima that have a weight beside the best."""
     best = max((one.log_density for one in optima), default=0.0)
-    return [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
+    return [one.values for one in optima if best - one.log_density < _WEIGHTLESS]
 
 
 def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
@@ -205,7 +209,7 @@ def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
             values, z, step, begun = best.values, float(row.coordinate(best.values[k])), side * first, False
             while low + _FINE < z + step < high - _FINE:
                 there = _held_at(posterior, problem, k, float(row.value_at(z + step)), values)
-                if there is not None and there.log_density > best.log_density - _WITHIN:
+                if there is not None and best.log_density - there.log_density < _WITHIN:
                     values, z, step, begun = there.values, z + step, _FURTHER * step, True
                     out.append(there)
                 elif begun or abs(step) < _LEAST_FIRST * first:

@@ -101,7 +101,7 @@ def _rest(
     for _ in range(2):
         chosen, noise = _with_noise(outer, chosen)
         chosen, reached, natural = done(Optima(pilot=True), chosen, chosen)
-    good = reached > reached.max() - _HOPELESS
+    good = np.isfinite(reached) & (reached >= reached.max() - _HOPELESS)
     chosen, noise, natural = chosen[good], noise[good], natural[good]
     own = ~outer.orders
     fitted = Conditional(posterior, delays=True).columns

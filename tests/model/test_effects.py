@@ -295,6 +295,35 @@ def test_a_runaway_is_reported_and_not_returned():
         made.with_effects([CubicStiffness()]).responses(values, np.array([-3.0]))
 
 
+def test_slopes_exist_wherever_the_response_is_bounded():
+    """Beside the largest force that does not run away a coefficient and a gain are differenced to the other
+    side, as here by hand."""
+    plain, values = lag_plant(250)
+    made, gain = plain.with_effects([CubicStiffness()]), plain.table.names.index("gain")
+    runaway, bounded = -3.0, 0.0
+    for _ in range(25):
+        middle = 0.5 * (runaway + bounded)
+        try:
+            made.responses(values, np.array([middle]))
+            bounded = middle
+        except UnstableError:
+            runaway = middle
+    psi, step, back = np.array([bounded]), 1e-4, values.copy()
+    with pytest.raises(UnstableError):
+        made.responses(values, psi - step)
+    here = made.responses(values, psi)[0]
+    by_hand = (made.responses(values, psi + step)[0] - here) / step
+    assert_allclose(made.signature(values, psi)[0][..., 0], by_hand, rtol=1e-6, atol=1e-9)
+    step = 1e-5 * float(made.ranges.response[0] / made.ranges.drive[0])
+    back[gain] -= step
+    by_hand = (here - made.responses(back, psi)[0]) / step
+    assert_allclose(made.jacobian(values, psi)[0][..., gain], by_hand, rtol=1e-6, atol=1e-9)
+    with pytest.raises(UnstableError):
+        made.jacobian(values, psi - 0.1)
+    with pytest.raises(UnstableError):
+        made.signature(values, psi - 0.1)
+
+
 def test_sensor_lag_is_one_more_lag():
     """A first-order plant behind a sensor of first order, in closed form."""
     command = on_off(1.0, hold=50.0, at=0.35)

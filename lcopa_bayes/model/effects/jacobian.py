@@ -1,21 +1,56 @@
-"""Derivatives of the responses with effects, in the coefficients and in the numbers of the plant."""
+"""Derivatives of the responses with effects, in the coefficients and in the numbers of the plant.
+
+They exist wherever the response is bounded: where it is not on one side of a number, as beside the largest
+coefficient that a plant endures, the difference is to the other.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import TypeAlias
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TypeAlias, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.model.effects.effect import DriveEffect, ParallelEffect, ReadoutEffect
+from lcopa_bayes.model.effects.effect import DriveEffect, ParallelEffect, ReadoutEffect, UnstableError
 from lcopa_bayes.model.effects.passage import Moved, Plant
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import Dynamics
 
 COEFFICIENT_STEP = 1e-3
 """Step of a coefficient, in prior standard deviations [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Difference:
+    """A difference in one coefficient, of one record or of all at once."""
+
+    columns: Index
+    """Its places among all coefficients, one per record if it has one in each."""
+    per_record: bool
+    steps: Vector
+    """[Unit of the coefficient]."""
+    weights: Vector
+    """Of the response without a step and of those with each [1 / unit]."""
+
+    def cases(self, psi: Vector) -> list[Vector]:
+        """Coefficients with each step."""
+        out = np.repeat(psi[None], self.steps.size, axis=0)
+        out[:, self.columns] += self.steps[:, None]
+        return list(out)
+
+    def to_one_side(self, simulator: Simulator, plant: Plant, psi: Vector) -> _Difference:
+        """The same, or where a response is not bounded there of first order to one side."""
+        step, sides = float(np.abs(self.steps).min()), np.array([-1.0, 1.0])
+        back, on = (replace(self, steps=np.array([one]), weights=sides / one) for one in (-step, step))
+        for difference in (self, back):
+            with suppress(UnstableError):
+                simulator.moved_together([(plant, each) for each in difference.cases(psi)])
+                return difference
+        return on
 
 
 def coefficient_slopes(
@@ -28,7 +63,7 @@ def coefficient_slopes(
     deviations, to one side where a one-signed coefficient would turn negative; of first order, exact but
     for what other effects bend, where the effect is `linear`. Coefficients of one record are moved in all
     records at once: records do not see each other's. What a parallel effect adds to a reading that no other
-    effect bends is the slope itself.
+    effect bends is the slope itself. Raises UnstableError where the response there is not bounded.
     """
     effects, records, first = simulator.effects, len(simulator.model.experiments), 0
     bent = any(isinstance(effect, ReadoutEffect) for effect in effects)
@@ -37,7 +72,7 @@ def coefficient_slopes(
         for e, effect in enumerate(effects)
         if isinstance(effect, ParallelEffect) and effect.linear and not bent
     }
-    cases, parts = [psi], list[tuple[Index, bool, Vector, slice]]()
+    differences = list[_Difference]()
     for e, effect in enumerate(effects):
         coefficients = effect.coefficients(simulator.ranges)
         repeats = records if effect.card.per_record else 1
@@ -50,28 +85,38 @@ def coefficient_slopes(
                 steps, weights = np.array([step, 2 * step]), np.array([-1.5, 2.0, -0.5])
             elif not effect.linear:
                 steps, weights = np.array([step, -step]), np.array([0.0, 0.5, -0.5])
-            place = slice(len(cases), len(cases) + steps.size)
-            parts.append((columns, effect.card.per_record, weights / step, place))
-            for each in steps:
-                moved = psi.copy()
-                moved[columns] += each
-                cases.append(moved)
+            differences.append(_Difference(columns, effect.card.per_record, steps, weights / step))
         first += len(coefficients) * repeats
-    moved_all = simulator.moved_together([(plant, each) for each in cases])
-    pairs = zip(moved_all, cases, strict=True) if parts else ()
-    read = [simulator.finished(moved, each) for moved, each in pairs]
-    out = [np.zeros((*deflection.shape, simulator.size)) for _, deflection in moved_all[0]]
-    for columns, per_record, weights, place in parts:
-        for r, there in enumerate(zip(read[0], *read[place], strict=True)):
-            slope = sum(w * y for w, y in zip(weights, there, strict=True))
-            out[r][..., columns[r if per_record else 0]] = slope
+    try:
+        here, read = _read(simulator, plant, psi, differences)
+    except UnstableError:
+        differences = [one.to_one_side(simulator, plant, psi) for one in differences]
+        here, read = _read(simulator, plant, psi, differences)
+    out = [np.zeros((*deflection.shape, simulator.size)) for _, deflection in here]
+    base, place = read[:1], 1
+    for one in differences:
+        place, there = place + one.steps.size, read[place : place + one.steps.size]
+        for r, responses in enumerate(zip(*base, *there, strict=True)):
+            slope = sum(w * y for w, y in zip(one.weights, responses, strict=True))
+            out[r][..., one.columns[r if one.per_record else 0]] = slope
     places = np.arange(simulator.size, dtype=float)
     for e, adds in adding.items():
-        for r, (scene, _) in enumerate(moved_all[0]):
+        for r, (scene, _) in enumerate(here):
             own = simulator.part(places, e, r).astype(int)
             for k, unit in zip(own, np.eye(own.size), strict=True):
                 out[r][..., k] = adds.added(scene, unit)
     return out
+
+
+def _read(
+    simulator: Simulator, plant: Plant, psi: Vector, differences: Sequence[_Difference]
+) -> tuple[list[Moved], list[list[Matrix]]]:
+    """Every record up to its reading, and the readings there and with each step of all differences; none
+    where nothing is differenced."""
+    cases = [psi, *(case for one in differences for case in one.cases(psi))]
+    moved = simulator.moved_together([(plant, each) for each in cases])
+    pairs = zip(moved, cases, strict=True) if differences else ()
+    return moved[0], [simulator.finished(own, each) for own, each in pairs]
 
 
 Number: TypeAlias = tuple[str, int, int]
@@ -91,10 +136,14 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
     if not simulator.effects:
         return _linear_slopes(simulator, plant, psi)
     numbers = list(_numbers(simulator, plant))
-    others = [_shifted(plant, number, step) for number, step in numbers]
     if simulator.bends(psi):
-        base, *moved = simulator.moved_together([(each, psi) for each in (plant, *others)])
+        try:
+            base, *moved = _with_each(simulator, plant, psi, numbers)
+        except UnstableError:
+            numbers = [_bounded(simulator, plant, psi, *one) for one in numbers]
+            base, *moved = _with_each(simulator, plant, psi, numbers)
     else:
+        others = [_shifted(plant, number, step) for number, step in numbers]
         base, exact = simulator.moved(plant, psi), _linear_slopes(simulator, plant, psi)
         delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
         moved = [
@@ -112,6 +161,25 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
         for r, there in enumerate(simulator.finished(each, psi)):
             out[r][number] = (there - here[r]) / step
     return out
+
+
+def _with_each(
+    simulator: Simulator, plant: Plant, psi: Vector, numbers: Sequence[tuple[Number, float]]
+) -> list[list[Moved]]:
+    """Every record of a plant, and with each of some numbers changed."""
+    others = [_shifted(plant, number, step) for number, step in numbers]
+    return simulator.moved_together([(each, psi) for each in (plant, *others)])
+
+
+def _bounded(
+    simulator: Simulator, plant: Plant, psi: Vector, number: Number, step: float
+) -> tuple[Number, float]:
+    """A number and its step, or where no response is bounded there the step to the other side."""
+    try:
+        simulator.moved_together([(_shifted(plant, number, step), psi)])
+    except UnstableError:
+        return number, -step
+    return number, step
 
 
 def _numbers(simulator: Simulator, plant: Plant) -> Iterator[tuple[Number, float]]:
