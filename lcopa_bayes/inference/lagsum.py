@@ -42,6 +42,8 @@ WEIGHT = 3.0
 a product of lags have weights of a few ranges, of either sign."""
 _VISIBLE = 1e-4
 """Squared part of a whitened response per unit weight that may be in no direction that is kept [-]."""
+_ROUNDING = 1e-12
+"""Share of itself by which a product of columns may be off [-]."""
 _SAMPLES = 4_000
 """Most samples of a response axis: of more one in so many is used, which widens intervals."""
 _VALUES = 4_000_000
@@ -110,7 +112,7 @@ class LagTable:
     def conditional(self, coordinates: Matrix) -> Conditional:
         """Distribution of the weights at coordinates (batch, dimension)."""
         columns = self.columns(coordinates)
-        precision = columns @ columns.swapaxes(1, 2) + np.eye(columns.shape[1]) / WEIGHT**2
+        precision = _precision(columns)
         root = np.asarray(np.linalg.cholesky(precision), dtype=float)
         bent = np.linalg.solve(root, (columns @ self.target)[..., None])[..., 0]
         return Conditional(root, bent, self.remainder + float(self.target @ self.target))
@@ -128,7 +130,7 @@ class LagTable:
         """What the most probable weights leave at coordinates (batch, dimension), and what their prior adds
         to the cost, (batch, directions + weights)."""
         columns = self.columns(coordinates)
-        precision = columns @ columns.swapaxes(1, 2) + np.eye(columns.shape[1]) / WEIGHT**2
+        precision = _precision(columns)
         weights = np.linalg.solve(precision, (columns @ self.target)[..., None])
         left = self.target - (columns.swapaxes(1, 2) @ weights)[..., 0]
         return np.concatenate([left, weights[..., 0] / WEIGHT], axis=1)
@@ -157,6 +159,15 @@ class Conditional:
         """One draw of the weights for each, (batch, weights)."""
         standard = self.bent + rng.standard_normal(self.bent.shape)
         return np.asarray(np.linalg.solve(self.root.swapaxes(1, 2), standard[..., None])[..., 0])
+
+
+def _precision(columns: Array) -> Array:
+    """Of the weights of columns (batch, weights, directions) given their prior, (batch, weights, weights);
+    regular where lags are alike and noise is so small that their products round its part away."""
+    products = columns @ columns.swapaxes(1, 2)
+    diagonal = np.diagonal(products, axis1=1, axis2=2)
+    own = _ROUNDING * diagonal + 1 / WEIGHT**2
+    return np.asarray(products + own[..., None] * np.eye(columns.shape[1]))
 
 
 def cubic(at: Array) -> tuple[Array, ...]:

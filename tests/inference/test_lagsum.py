@@ -283,3 +283,14 @@ def test_samples_may_lie_anywhere_along_what_they_are_open_to() -> None:
     assert two.log_density(coordinates) == pytest.approx(one.log_density(coordinates), abs=1e-6)
     closed = lag_table(other, 0, [0], noise, delays)
     assert np.abs(closed.log_density(coordinates) - one.log_density(coordinates)).min() > 1.0
+
+
+def test_lags_that_are_alike_leave_what_one_leaves_under_noise_of_nearly_nothing() -> None:
+    """The prior of their weights tells them apart, and is rounded away in their products."""
+    table = tabulated(lag_problem(made()))
+    clear = replace(table, responses=1e9 * table.responses, target=1e9 * table.target)
+    one, both = np.array([[np.log(0.6), 0.43]]), np.array([[np.log(0.6), np.log(0.6), 0.43]])
+    left, again = (clear.residuals(each)[0, : table.target.size] for each in (one, both))
+    assert np.linalg.norm(left) > 1e6
+    assert np.allclose(again, left, rtol=0, atol=1e-5 * np.linalg.norm(left))
+    assert np.isfinite(clear.conditional(both).log_marginal).all()
