@@ -215,8 +215,9 @@ def _step(state: State, signature: Signature, seen: Trace) -> tuple[Vector, Matr
     cross = tangents.T @ columns
     gain = np.zeros((free.size, columns.shape[1]))
     gain[free] = covariance_of(optimum.information[np.ix_(free, free)]) @ cross
-    inverse = np.eye(columns.shape[1]) + columns.T @ columns - cross.T @ gain[free]
-    covariance = np.asarray(np.linalg.inv(inverse), dtype=float)
+    left, moved = columns - optimum.jacobian @ gain, gain / state.model.spread[:, None]
+    # equal to I + S' S - S' J G, whose difference may be lost in rounding
+    covariance = covariance_of(np.eye(columns.shape[1]) + left.T @ left + moved.T @ moved)
     return -gain @ (covariance @ (columns.T @ optimum.settled)), -gain @ root_of(covariance)
 
 

@@ -66,7 +66,9 @@ class Refit:
     def left_out(self) -> float:
         """Gain of the summed log predictive densities of records left out in turn [nat]."""
         apart = groups(self.whitening)
-        return float(log_scores(self.optimum, apart).sum() - log_scores(self.before, apart).sum())
+        now, was = (log_scores(optimum, apart) for optimum in (self.optimum, self.before))
+        known = np.isfinite(now) | np.isfinite(was)  # what others determine for neither says nothing
+        return float((now[known] - was[known]).sum())
 
     @property
     def state(self) -> State:

@@ -124,7 +124,8 @@ class Regression:
 
     def _cost(self, x: Vector, white: Vector) -> float:
         mean, precision = self._prior
-        return float(0.5 * (white @ white) + 0.5 * (precision * (x - mean) ** 2).sum())
+        with np.errstate(over="ignore"):  # as far from the records as that nothing is likely
+            return float(0.5 * (white @ white) + 0.5 * (precision * (x - mean) ** 2).sum())
 
     def reached(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> tuple[Vector, bool]:
         """Coordinates of a local optimum within the support, its terms in the sequence of the report, and
@@ -165,6 +166,8 @@ class Regression:
         white, jacobian = both[0], np.ascontiguousarray(both[1:].T)
         low, high = self.model.bounds
         spread, cost = self.model.spread, self._cost(x, white)
+        if not np.isfinite(cost):
+            raise FloatingPointError("the residual is too large to be squared")
         slope = self._slope(x, white, jacobian)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
         ends = self.model.bounds_about(x)

@@ -34,6 +34,7 @@ from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.run import SamplePlan
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +201,17 @@ def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close
     for name in ("gain", "time_1", "delay"):
         sd, error = own.column(name).std(), np.sqrt(1 / own.ess + 1 / draws.ess)
         assert draws.column(name).mean() == pytest.approx(own.column(name).mean(), abs=4 * sd * error)
+
+
+@pytest.mark.parametrize(("stated", "seconds"), [(None, explained.SEARCH), (300.0, 300.0)])
+def test_a_search_for_draws_has_little_time_unless_the_study_states_more(monkeypatch, stated, seconds):
+    plans: list[SamplePlan] = []
+    monkeypatch.setattr(explained, "weighted_run", lambda *given, **how: None)
+    monkeypatch.setattr(explained, "by_search", lambda posterior, plan, *_, **how: plans.append(plan))
+    own = study(1)
+    own = replace(own, sampler=replace(own.sampler, seconds=stated))
+    assert explained_draws(own, lambda draws, noise: True, quick=True) is None
+    assert [plan.seconds for plan in plans] == [seconds]
 
 
 def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):

@@ -108,6 +108,25 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
     assert again.optimum.cost <= again.before.cost + 1e-9
 
 
+def test_what_no_other_record_determines_says_nothing_of_an_effect(base, monkeypatch):
+    """Before and after, the log density of such a record is minus infinity; of one alone it decides."""
+    state = base.start
+    made = refit(state.model, state.optimum, state.whitening, [(PAIR[0], np.ones(1))], 50.0)
+    for now, was, gain in (((-np.inf, -3.0), (-np.inf, -5.0), 2.0), ((-np.inf, -3.0), (-1.0, -5.0), -np.inf)):
+        scores = {id(made.optimum): np.array(now), id(made.before): np.array(was)}
+        monkeypatch.setattr(refits, "log_scores", lambda optimum, _, scores=scores: scores[id(optimum)])
+        assert replace(made).left_out == gain
+
+
+def test_a_residual_too_large_to_be_squared_is_not_likely(base):
+    state = base.start
+    far = np.where(np.arange(state.optimum.x.size) == 0, 1e160, state.optimum.x)
+    regression = Regression(state.model, state.whitening)
+    assert regression.cost(far) == np.inf
+    with pytest.raises(FloatingPointError, match="too large"):
+        regression.at(far)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_constants_are_moved_only_where_an_effect_is_worth_something(base, monkeypatch, known):
     """Under noise that is known: noise of the residual alone holds the effect too."""

@@ -14,6 +14,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
+from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
@@ -68,6 +69,24 @@ def test_one_linear_step_is_the_optimum_with_the_effect():
     np.testing.assert_allclose(shift / sd, moved, atol=0.15)
     whole = np.sqrt(np.diag(state.optimum.covariance + root @ root.T))
     np.testing.assert_allclose(whole, sd, rtol=0.1)
+
+
+def test_what_only_the_prior_tells_apart_has_a_width_under_noise_of_nearly_nothing():
+    """An effect that is a tangent: what others leave of it is rounding in a difference of products."""
+    _, state = fitted(study_of(0.075))
+    laws = tuple(Law(1e-10 * one.sd) for one in state.whitening.noise)
+    white = replace(state.whitening, noise=laws, posterior=())
+    optimum = Regression(state.model, white).at(state.optimum.x)
+    for k, spread in enumerate(state.model.spread):
+        same = SimpleNamespace(
+            spread=state.model.spread, signature=lambda *_, k=k: (optimum.tangents[:, [k]], None)
+        )
+        clear = SimpleNamespace(model=same, whitening=white, optimum=optimum)
+        unit = SimpleNamespace(effect=None, width=lambda *_: 1.0)
+        _, root = _step(clear, unit, SimpleNamespace(residual=None, scale=None))
+        # psi ~ N(0, 1) beside a coordinate of that spread, whose sum the records know
+        expected = 1 / np.sqrt(1 + spread**-2)
+        assert np.sqrt((root[k] ** 2).sum()) == pytest.approx(expected, rel=0.05)
 
 
 def test_what_cannot_be_seen_is_in_the_interval(faint: Loop):
