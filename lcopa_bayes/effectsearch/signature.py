@@ -25,6 +25,8 @@ _LEAST_POWER = 1e-10
 """Power of a direction of a signature at one prior sd below which it is nothing [-]."""
 _RANK = 1e-9
 """Singular values below this share of the largest are zero [-]."""
+_ROUNDED = 1e-6
+"""Share of a residual's power that remains of it at least: directions are of single precision [-]."""
 
 
 @final
@@ -85,8 +87,8 @@ class Scale:
 
     def gain(self, half_power: Vector) -> Vector:
         """Log evidence of a drop of half the residual power, (draws,) [nat]."""
-        whole = self.quiet + self.power
-        return np.asarray(-0.5 * (self.quiet + self.freedom) * np.log1p(-2 * half_power / whole))
+        taken = np.minimum(2 * half_power, (1 - _ROUNDED) * self.power)
+        return np.asarray(-0.5 * (self.quiet + self.freedom) * np.log1p(-taken / (self.quiet + self.power)))
 
     def drop(self, gain: float) -> float:
         """Drop of half the residual power that is worth `gain` nat, the inverse of `gain` [-]."""

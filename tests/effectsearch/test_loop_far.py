@@ -203,6 +203,9 @@ def test_overdrive_that_an_order_above_one_imitates_is_named():
 
 def test_a_drop_of_power_is_the_inverse_of_its_worth():
     scale = Scale(40.0, 300.0, np.array([900.0]))
+    whole = 0.5 * np.array([1.0, 1 + 1e-6]) * 1e12  # by single precision more than there is
+    gain = Scale(40.0, 300.0, np.array([1e12])).gain(whole)
+    assert gain[0] == gain[1] == pytest.approx(170.0 * np.log(1e6), rel=1e-3)
     for half in (1.0, 50.0, 400.0):
         assert scale.drop(float(scale.gain(np.array([half]))[0])) == pytest.approx(half, rel=1e-10)
 
