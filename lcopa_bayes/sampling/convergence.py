@@ -11,7 +11,7 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.stats import chi2, norm, rankdata, spearmanr
 
-from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.arrays import Array, Index, Vector
 from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.sampling.modes import Modes
@@ -205,12 +205,19 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
                 name,
                 float(array_stats.ess(chains, method="bulk")),  # type: ignore[no-untyped-call]
                 float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),  # type: ignore[no-untyped-call]
-                float(array_stats.rhat_nested(chains, owner)),  # type: ignore[no-untyped-call]
+                nested_rhat(chains, owner),
                 rank_correlation(chains[:, 0], chains[:, -1]),
                 *_shared(values[..., k]),
             )
         )
     return tuple(out)
+
+
+def nested_rhat(chains: Array, owner: Index) -> float:
+    """Nested rank R-hat of chains (chains, draws) of ensembles `owner`, (chains,) [-]; infinite or NaN where
+    no chain varies."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(array_stats.rhat_nested(chains, owner))  # type: ignore[no-untyped-call]
 
 
 def _shared(values: Array) -> tuple[float, float, float]:

@@ -9,7 +9,6 @@ from math import sqrt
 from typing import final
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, digest_of
 from lcopa_bayes.core.estimate import Estimate
@@ -21,6 +20,7 @@ from lcopa_bayes.sampling.convergence import (
     Limitation,
     Quality,
     limited,
+    nested_rhat,
     overall,
     qualities,
     shares_grade,
@@ -246,7 +246,7 @@ def _resampled(
             Quality(
                 row.name,
                 *(size := sizes.get(k, (float(bulk), float(ends)))),
-                float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
+                nested_rhat(values[..., k], np.arange(len(chosen))),
                 scatter=sqrt(len(chosen) / size[0]),
             ),
             multimodal,

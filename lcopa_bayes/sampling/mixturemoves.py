@@ -20,10 +20,13 @@ _JOINTLY = 16
 def learned(posterior: Posterior, chains: Sequence[Array], seed: int) -> Mixture:
     """Mixture in the chart of a posterior, fitted to chains (draws, walkers, dimension).
 
-    From the draws of all ensembles: a mode that one has reached, all can then reach.
+    From the draws of all ensembles: a mode that one has reached, all can then reach. About the middle of the
+    chart where nearly all draws are in corners of the prior, which have no place in it: walkers then move by
+    each other alone.
     """
     pooled = np.concatenate([chain.reshape(-1, posterior.dimension) for chain in chains])
-    return Mixture.fitted(Chart.of(posterior).usable(pooled)[1], seed)
+    charted = Chart.of(posterior).usable(pooled)[1]
+    return Mixture.fitted(charted if len(charted) > 1 else np.zeros((2, posterior.dimension)), seed)
 
 
 def parts(posterior: Posterior, mixture: Mixture) -> list[tuple[Index, Mixture]]:

@@ -7,7 +7,7 @@ every average follows from the weights themselves (Owen 2013, Monte Carlo theory
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import sqrt
@@ -176,10 +176,11 @@ class Weighted:
 
     @cached_property
     def centre_ess(self) -> Vector:
-        """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
+        """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,); that
+        of the weights where those that count are of one value."""
         if self.factors:
             return self._of_factors(lambda one: one.centre_ess)
-        return np.array([_worth(own, self._weights) for own in self.scores.T])
+        return self._known([_worth(own, self._weights) for own in self.scores.T])
 
     @cached_property
     def tail_ess(self) -> Vector:
@@ -187,7 +188,11 @@ class Weighted:
         if self.factors:
             return self._of_factors(lambda one: one.tail_ess)
         each = [[_worth(own, self._weights) for own in end.T] for end in self.below]
-        return np.asarray(np.min(each, axis=0))
+        return self._known(np.min(each, axis=0))
+
+    def _known(self, worth: Sequence[float] | Vector) -> Vector:
+        """Effective sample sizes, that of the weights where nothing varies."""
+        return np.asarray(np.where(np.isinf(worth), self.ess, worth))
 
     @cached_property
     def boundaries(self) -> tuple[tuple[float, ...], ...]:

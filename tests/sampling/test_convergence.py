@@ -92,7 +92,6 @@ def test_effective_sample_size_of_an_autoregression():
     assert one(chains).ess_bulk == pytest.approx(exact, rel=0.15)
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_parameter_that_does_not_vary_is_unusable():
     stuck = np.ones(SHAPE)
     assert one(stuck).grade(1).level == "unusable"

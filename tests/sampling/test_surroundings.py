@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small import problem, record
 
 from lcopa_bayes.core.arrays import Matrix
@@ -15,9 +16,10 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling import sampler
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.run import Run, SamplePlan
 from lcopa_bayes.sampling.sampler import sample
-from lcopa_bayes.sampling.tempering import surroundings
+from lcopa_bayes.sampling.tempering import surroundings, temper
 
 POSTERIOR = problem(record(camera=0.6)).posterior
 
@@ -25,6 +27,30 @@ POSTERIOR = problem(record(camera=0.6)).posterior
 @cache
 def optima() -> tuple[Optimum, ...]:
     return find_optima(POSTERIOR, np.random.default_rng(1), starts=4)
+
+
+def generator() -> tuple[Any, ...]:
+    return tuple(np.random.RandomState(np.random.MT19937(1)).get_state())
+
+
+def test_after_its_time_the_temperature_rises_at_once():
+    """A few walkers survive, and what is returned is a population at the density it says."""
+    rng = np.random.default_rng(2)
+    late, _ = temper(POSTERIOR, 20, 80, rng, generator(), seconds=0.0)
+    patient, _ = temper(POSTERIOR, 20, 80, rng, generator())
+    assert late.moves == 20  # one block of five of four times as many walkers
+    assert patient.moves > 10 * late.moves
+    assert_allclose(late.log_density, POSTERIOR.log_density(late.position))
+    assert patient.log_density.mean() > late.log_density.mean()
+
+
+def test_walkers_in_corners_of_the_prior_have_a_mixture_too():
+    """Where they are the chart has no place: nothing is learned of them, and nothing fails."""
+    centre = POSTERIOR.coordinates(optima()[0].values[None])
+    order = POSTERIOR.sampled.index(POSTERIOR.table.names.index("order_1"))
+    centre[:, order] = POSTERIOR.table.rows[POSTERIOR.sampled[order]].sampled_domain[1]
+    mixture = learned(POSTERIOR, [np.repeat(centre[None], 30, axis=0)], 1)
+    assert np.isfinite(mixture.log_density(np.zeros((1, POSTERIOR.dimension)))).all()
 
 
 def run(monkeypatch: pytest.MonkeyPatch, target: float, seed: int = 3, **limits: Any) -> Run:

@@ -41,6 +41,14 @@ def test_effective_sizes_are_those_of_equal_weights():
     assert np.isnan(weighted.pareto_k)
 
 
+def test_where_one_draw_has_all_the_weight_there_is_one(rng):
+    """Not infinitely many, though nothing varies among those that count."""
+    z, raw = rng.standard_normal((500, 2)), np.zeros(500)
+    raw[7] = 1e4
+    weighted = Weighted.of(TOY, z, np.zeros(500), raw, 500, smooth=False)
+    assert_allclose([weighted.centre_ess, weighted.tail_ess], 1.0)
+
+
 CENTRES, SHARES = np.array([0.0, 7.0, -8.0]), np.array([0.88, 0.09, 0.03])
 
 
