@@ -1,13 +1,13 @@
-"""Give `loop` small campaigns of every shape, as they are and spoiled, and tell what came of them.
+"""Give a verb small campaigns of every shape, as they are and spoiled, and say what came of them.
 
-    python studies/robustness/spoiled.py [--campaigns N] [--seed S] [--limit SECONDS] [--jobs N]
-        [--out FOLDER]
+    python studies/robustness/spoiled.py [--verb VERB] [--campaigns N] [--seed S] [--limit SECONDS]
+        [--jobs N] [--out FOLDER]
 
 Plants, shapes, clocks and hidden effects are those of `studies/undeclared-effects/foreign.py`; records are
-thinned to six samples or more, spoiled in one of `SPOILINGS`, and given in other units. Every campaign is
-looped into a run folder of its own, four of five with the structure as stated. A campaign crashes where it
-ends in anything but a result or a refusal in words, a warning included. Finished rows are kept in the folder:
-a killed run goes on where it stopped. Exit code 1 after a crash.
+thinned to six samples or more, spoiled in one of `SPOILINGS`, and given in other units. Every campaign goes
+into a run folder of its own, four of five with the structure as stated. A campaign crashes where it ends in
+anything but a result or a refusal in words, a warning included. Finished rows are kept in the folder: a
+killed run goes on where it stopped. Exit code 1 after a crash.
 """
 
 import argparse
@@ -20,6 +20,7 @@ import time
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -38,6 +39,8 @@ from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.verbs.fit import fit
+from lcopa_bayes.verbs.look import look
 from lcopa_bayes.verbs.loop import loop
 
 SPOILINGS = (
@@ -55,11 +58,18 @@ SIZES = (6, 12, 25, 50, 100)
 """Samples per record, about [-]."""
 AS_STATED = 0.8
 """Share of campaigns whose structure is as stated [-]."""
-OUTCOMES = ("clean", "explained", "partly explained", "disturbance", "unexplained", "refused", "not in time")
+DRAWING = 5.0
+"""Time for the draws of a fit [s]."""
+RESULTS = {
+    "loop": ("clean", "explained", "partly explained", "disturbance", "unexplained"),
+    "fit": ("reliable", "tentative", "unusable"),
+    "look": ("seen",),
+}
+"""What a verb says of a campaign: its verdict, the grade of its draws, or that there is a first look."""
 HEADING = """# Campaigns of every shape
 
 Small campaigns of plants outside the family, with none to two hidden effects, as they are and spoiled,
-through `loop` into a run folder. *Refused*: ended with a sentence of what is wrong with the records."""
+through a verb into a run folder. *Refused*: ended with a sentence of what is wrong with the records."""
 
 
 def spoiled(record: Record, how: str, size: int, scales: tuple[float, float, float]) -> Record:
@@ -125,9 +135,30 @@ def study(seed: int) -> tuple[Study, dict[str, Any]]:
     return replace(own, fit=fit, held_out=held_out, model=model), said
 
 
-def play(limit: int, seed: int) -> dict[str, Any]:
-    """What came of one campaign within `limit` [CPU s]."""
-    began, row = time.process_time(), {"seed": seed}
+def _looped(own: Study, folder: Path, *, stated: bool) -> str:
+    result = loop(own, as_stated=stated, quick=True, folder=folder)
+    result.summary()
+    return str(result.values["verdict"])
+
+
+def _fitted(own: Study, folder: Path, *, stated: bool) -> str:
+    brief = replace(own, sampler=replace(own.sampler, seconds=DRAWING))
+    result = fit(brief, quick=True, folder=folder, page=True)
+    result.summary()
+    return result.draws.grade.level
+
+
+def _looked(own: Study, folder: Path, *, stated: bool) -> str:
+    look(own, folder=folder).summary()
+    return "seen"
+
+
+VERBS: dict[str, Callable[..., str]] = {"loop": _looped, "fit": _fitted, "look": _looked}
+
+
+def play(known: tuple[str, int], seed: int) -> dict[str, Any]:
+    """What a verb gives of one campaign within a limit [CPU s]."""
+    (verb, limit), began, row = known, time.process_time(), {"seed": seed}
     signal.signal(signal.SIGPROF, _too_long)
     try:
         with warnings.catch_warnings(), tempfile.TemporaryDirectory() as place:
@@ -135,9 +166,7 @@ def play(limit: int, seed: int) -> dict[str, Any]:
             signal.setitimer(signal.ITIMER_PROF, limit)
             own, said = study(seed)
             row |= said
-            result = loop(own, as_stated=row["stated"], quick=True, folder=Path(place) / "run")
-            result.summary()
-            row["outcome"] = result.values["verdict"]
+            row["outcome"] = VERBS[verb](own, Path(place) / "run", stated=row["stated"])
     except InputError as error:
         row |= {"outcome": "refused", "said": str(error)}
     except TimeoutError:
@@ -153,9 +182,9 @@ def _too_long(number: int, frame: object) -> NoReturn:
     raise TimeoutError
 
 
-def page(rows: list[dict[str, Any]], command: str, limit: int) -> str:
+def page(rows: list[dict[str, Any]], command: str, verb: str, limit: int) -> str:
     """The summary in Markdown."""
-    outcomes = [*OUTCOMES, "crashed"]
+    outcomes = [*RESULTS[verb], "refused", "not in time", "crashed"]
     lines = [HEADING, "", f"`{command}`: {len(rows)} campaigns, {limit} CPU s each at most.", ""]
     lines += [f"| responses x drives | {' | '.join(outcomes)} | median [CPU s] | longest [CPU s] |"]
     lines += [f"|---|{'---:|' * (len(outcomes) + 2)}"]
@@ -179,6 +208,7 @@ def main() -> int:
     numbers = {"campaigns": 1000, "seed": 500_000, "limit": 120, "jobs": 1}
     for name, default in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--verb", choices=VERBS, default="loop")
     parser.add_argument("--out", type=Path, default=Path("reports/robustness/spoiled"))
     parser.add_argument("--quiet", action="store_true")
     given = parser.parse_args()
@@ -187,12 +217,12 @@ def main() -> int:
     kept = {seed: folder / f"{seed}.json" for seed in seeds}
     rows = [json.loads(file.read_text(encoding="utf-8")) for file in kept.values() if file.exists()]
     missing = [seed for seed, file in kept.items() if not file.exists()]
-    with workers(given.limit, jobs=given.jobs) as crew:
+    with workers((given.verb, given.limit), jobs=given.jobs) as crew:
         for row in tqdm(crew.finished(play, missing), total=len(missing), disable=given.quiet):
             write_text(kept[row["seed"]], json.dumps(row) + "\n")
             rows.append(row)
     command = shlex.join(["python", "studies/robustness/spoiled.py", *sys.argv[1:]])
-    text = page(sorted(rows, key=lambda row: row["seed"]), command, given.limit)
+    text = page(sorted(rows, key=lambda row: row["seed"]), command, given.verb, given.limit)
     write_text(given.out / "report.md", text)
     print(text)
     return int(any(row["outcome"] == "crashed" for row in rows))
