@@ -21,6 +21,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.resolvedmodel import shift_by_width
 from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
@@ -28,7 +29,7 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
-from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
+from lcopa_bayes.results.discretisation import narrowed
 
 _MOST = 3
 _GAIN = 10.0
@@ -249,11 +250,10 @@ def _state(study: Study, fit: BaseFit) -> State:
 
 def _shift(fit: BaseFit, problem: Problem) -> float:
     """Largest shift of the base fit's parameters on narrower blocks than the problem's [posterior sd]."""
-    model, x, white = ExtendedModel(problem.posterior), fit.optimum.x, fit.regression.whitening
-    here, tangents = model.tangents(x)
-    finer = [ExtendedModel(problem.refined(factor).posterior) for factor in FACTORS]
-    changes = [white(each.predict(x) - here) for each in finer]
-    return largest_shift(fit.optimum.covariance, white(tangents.T).T, changes)
+    optimum, white = fit.optimum, fit.regression.whitening
+    return shift_by_width(
+        lambda one: ExtendedModel(one.posterior), problem, optimum.x, optimum.covariance, white
+    )
 
 
 def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | None = None) -> float:

@@ -33,6 +33,7 @@ from lcopa_bayes.effectsearch.openeffects import alternatives
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
+from lcopa_bayes.effectsearch.resolvedmodel import resolved
 from lcopa_bayes.effectsearch.rounds import Search, search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
@@ -283,7 +284,7 @@ class _Judged:
 
     def sampled(self, options: _Options) -> Loop:
         """The loop, by draws of the explained study where there are any that predict as its optimum does."""
-        problem, crew, cautions = self.begun.base.problem, options.crew, self.begun.cautions
+        crew, cautions = options.crew, self.begun.cautions
         drawn = None
         if options.sample and declarable(self.begun.study, self.state.model.effects):
             crew.stage(f"{self.verdict.kind}; drawing from the posterior")
@@ -292,9 +293,17 @@ class _Judged:
         if drawn is not None and astray(self.after, drawn):
             drawn, cautions = None, (*cautions, _ASTRAY)
         crew.stage(f"{self.verdict.kind}; weighing what else the records leave open")
-        after = drawn or (self.after if self.state is self.after.state else Side.of(problem, self.state))
+        after = drawn or self._at_optimum
         loop = self.begun.ending(self.verdict, self.before if self.verdict.names else after, after)
         return self._weighed(replace(loop, cautions=cautions, rounds=self.searched.rounds), crew)
+
+    @property
+    def _at_optimum(self) -> Side:
+        """The final model at its optimum, on blocks that its effects ask for: those of draws are too."""
+        state, problem = self.state, self.begun.base.problem
+        if state.model.effects:
+            state, problem = resolved(state, problem)
+        return self.after if state is self.after.state else Side.of(problem, state)
 
     def _drawn(self, *, jobs: int, quick: bool) -> Side | None:
         """The final model by draws of the explained study; None where there are none."""

@@ -105,6 +105,11 @@ class Effected:
             self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
         )
 
+    def on(self, model: ForwardModel) -> Effected:
+        """The same on other blocks."""
+        simulator = replace(self.simulator, model=model, step_responses=Latest(), still=Latest())
+        return replace(self, simulator=simulator)
+
     def plant(self, values: Vector) -> Plant:
         """The plant of the table's values, (rows,)."""
         return plant_of(self.table, values, self.offsets, len(self.records))
