@@ -46,6 +46,12 @@ def test_the_distance_is_that_of_the_residual():
     assert distance == pytest.approx(TRUTH["sigma"] / SIGMA, rel=0.2)
 
 
+def test_the_record_that_is_followed_least_is_named():
+    own = posterior(1e6)
+    with pytest.raises(InputError, match="^record 'other': response 'y' is about "):
+        refuse_unresolved(own, truth(own), 1.01 * LEAST)
+
+
 def test_from_the_limit_on_nothing_is_refused():
     own = posterior(1.0)
     refuse_unresolved(own, truth(own), LEAST)
