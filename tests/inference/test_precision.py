@@ -48,7 +48,7 @@ def test_the_distance_is_that_of_the_residual():
 
 def test_the_record_that_is_followed_least_is_named():
     own = posterior(1e6)
-    with pytest.raises(InputError, match="^record 'other': response 'y' is about "):
+    with pytest.raises(InputError, match=r"^record 'other': response 'y' is about "):
         refuse_unresolved(own, truth(own), 1.01 * LEAST)
 
 
