@@ -7,7 +7,6 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from math import log
 from pathlib import Path
 from typing import Any, final
@@ -223,8 +222,7 @@ class Contender:
             save_json(entries, self.folder / CARD)
 
     def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
-        own = partial(fit, folder=folder, resume=self.resume, quick=self.quick)
-        return own(study, starts=starts, budget=BUDGET)
+        return fit(study, folder=folder, resume=self.resume, quick=self.quick, starts=starts, budget=BUDGET)
 
 
 _ROUGHLY = Limitation(

@@ -295,7 +295,7 @@ class _Judged:
         crew.stage(f"{self.verdict.kind}; weighing what else the records leave open")
         after = drawn or self._at_optimum
         loop = self.begun.ending(self.verdict, self.before if self.verdict.names else after, after)
-        return self._weighed(replace(loop, cautions=cautions, rounds=self.searched.rounds), crew)
+        return self._weighed(replace(loop, cautions=cautions), crew)
 
     @property
     def _at_optimum(self) -> Side:
@@ -333,6 +333,7 @@ class _Judged:
         weighs = self.verdict.kind != "unexplained" and loose is None
         return replace(
             loop,
+            rounds=self.searched.rounds,
             groups=self.searched.groups if self.verdict.names else (),
             draws=None if sampled is None else sampled[0],
             loose=loose,
