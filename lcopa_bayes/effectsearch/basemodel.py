@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.resolvedmodel import shift_by_width
+from lcopa_bayes.effectsearch.resolvedmodel import moved, on, shift_by_width
 from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import trace
@@ -57,6 +57,18 @@ class Base(NamedTuple):
     """Plants that contain it and were not chosen."""
     look: Round | None = None
     """What it leaves; None where nobody looked yet."""
+
+    def on(self, problem: Problem) -> Base:
+        """The same on the blocks of a problem where these are narrower; nobody looked at what it leaves
+        there. ArithmeticError where a response there is not bounded."""
+        richer = tuple(one.on(one.problem.at_least(problem.refinement)) for one in self.richer)
+        if problem.refinement <= self.problem.refinement:
+            return self._replace(richer=richer)
+        start = moved(self.start, problem)
+        model = on(self.fit.model, problem)
+        regression = Regression(model, start.whitening)
+        fit = replace(self.fit, model=model, regression=regression, optimum=start.optimum)
+        return self._replace(problem=problem, fit=fit, start=start, richer=richer, look=None)
 
 
 def structure_chosen(study: Study, *, as_stated: bool) -> bool:

@@ -52,12 +52,12 @@ def following(model: ExtendedModel, samples: Sequence[Samples]) -> ExtendedModel
 
 
 def descended_with_effects(state: State, plant: ExtendedModel, x: Vector) -> tuple[ExtendedModel, Optimum]:
-    """Another plant at scales of its own, with the effects of a state on its records, and its optimum, from
-    the coordinates `x` of the plant alone and the state's coefficients.
+    """Another plant with the effects of a state, at the scales of these and on its records, and its optimum,
+    from the coordinates `x` of the plant alone and the state's coefficients.
 
     ArithmeticError where there is no bounded response.
     """
     effects = state.optimum.x[state.model.plant_size :]
-    model = following(plant.having(*state.model.effects), state.whitening.samples)
-    model = replace(model, wider=state.model.wider)
+    scaled = plant.with_ranges(state.model.effected.ranges).having(*state.model.effects)
+    model = replace(following(scaled, state.whitening.samples), wider=state.model.wider)
     return model, Regression(model, state.whitening).descend(np.concatenate([x, effects]))

@@ -33,7 +33,7 @@ from lcopa_bayes.effectsearch.openeffects import alternatives
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
-from lcopa_bayes.effectsearch.resolvedmodel import resolved
+from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
 from lcopa_bayes.effectsearch.rounds import Search, search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
@@ -91,12 +91,11 @@ def _looped(study: Study, kinds: Sequence[type[Effect]], options: _Options) -> L
     options.crew.stage(f"without effects {begun.before.said}; looking for what is missing")
     if not begun.searchable:
         return begun.unexplained(obstacle)
-    searched = begun.search(options)
+    begun, searched = begun.search(options)
     richer = beside_effects(begun.base, searched) if begun.chosen else None
     if richer is not None:
         options.crew.stage("searching again with a richer plant")
-        begun = replace(begun, base=richer)
-        searched = begun.search(options)
+        begun, searched = replace(begun, base=richer).search(options)
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if obstacle and too_smooth(searched.state.optimum):
         return begun.unexplained(obstacle)
@@ -178,7 +177,26 @@ class _Begun:
         """Plants that contain the chosen one; None of a structure that is stated."""
         return tuple(one.start for one in self.base.richer) if self.chosen else None
 
-    def search(self, options: _Options) -> Search:
+    def search(self, options: _Options) -> tuple[Self, Search]:
+        """All rounds, and the base fit on blocks as narrow as the effects that these added ask for; searched
+        again there where something remains, which wide blocks may have left."""
+        searched = self._rounds(options)
+        problem, state = self.base.problem, searched.state
+        if not state.model.effects:
+            return self, searched
+        try:
+            narrow = narrowed_for(state, problem)
+            if narrow is problem:
+                return self, searched
+            begun, state = replace(self, base=self.base.on(narrow)), moved(state, narrow)
+        except ArithmeticError:  # no bounded response on narrower blocks
+            return self, searched
+        if not searched.rounds[-1].alarmed:
+            return begun, replace(searched, state=state)
+        options.crew.stage("searching again on narrower blocks, which the effects ask for")
+        return begun.search(options)
+
+    def _rounds(self, options: _Options) -> Search:
         """Rounds under the noise that was measured; where too few samples at rest measured it and nothing
         stands out, again under noise known from the residual alone."""
         fit, start = self.base.fit, self.base.start
@@ -293,17 +311,10 @@ class _Judged:
         if drawn is not None and astray(self.after, drawn):
             drawn, cautions = None, (*cautions, _ASTRAY)
         crew.stage(f"{self.verdict.kind}; weighing what else the records leave open")
-        after = drawn or self._at_optimum
+        problem = self.begun.base.problem
+        after = drawn or (self.after if self.state is self.after.state else Side.of(problem, self.state))
         loop = self.begun.ending(self.verdict, self.before if self.verdict.names else after, after)
         return self._weighed(replace(loop, cautions=cautions), crew)
-
-    @property
-    def _at_optimum(self) -> Side:
-        """The final model at its optimum, on blocks that its effects ask for: those of draws are too."""
-        state, problem = self.state, self.begun.base.problem
-        if state.model.effects:
-            state, problem = resolved(state, problem)
-        return self.after if state is self.after.state else Side.of(problem, state)
 
     def _drawn(self, *, jobs: int, quick: bool) -> Side | None:
         """The final model by draws of the explained study; None where there are none."""

@@ -18,26 +18,25 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
 
 
-def resolved(state: State, problem: Problem) -> tuple[State, Problem]:
-    """A final model with effects, at its optimum on blocks as narrow as it asks for, and the problem with
-    these; itself where the blocks are narrow enough, or no response on narrower ones is bounded."""
+def narrowed_for(state: State, problem: Problem) -> Problem:
+    """The problem on blocks as narrow as a state asks for at its optimum; itself where they are."""
     white, x, covariance = state.whitening, state.optimum.x, state.optimum.covariance
-    try:
-        narrow = narrowed(
-            problem, lambda each: shift_by_width(lambda one: on(state.model, one), each, x, covariance, white)
-        )
-        if narrow is problem:
-            return state, problem
-        model = on(state.model, narrow)
-        return replace(state, model=model, optimum=Regression(model, white).descend(x)), narrow
-    except ArithmeticError:
-        return state, problem
+    return narrowed(
+        problem, lambda each: shift_by_width(lambda one: on(state.model, one), each, x, covariance, white)
+    )
+
+
+def moved(state: State, problem: Problem) -> State:
+    """A state at its optimum on the blocks of a problem."""
+    model = on(state.model, problem)
+    return replace(state, model=model, optimum=Regression(model, state.whitening).descend(state.optimum.x))
 
 
 def on(model: ExtendedModel, problem: Problem) -> ExtendedModel:
     """A model with effects on the blocks of a problem, at the same scales."""
     blocks = problem.posterior.model
-    return replace(model, plant=replace(model.plant, model=blocks), scaled=model.effected.on(blocks))
+    scaled = model.scaled and model.scaled.on(blocks)
+    return replace(model, plant=replace(model.plant, model=blocks), scaled=scaled)
 
 
 def shift_by_width(

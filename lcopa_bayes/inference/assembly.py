@@ -83,6 +83,11 @@ class Problem:
         _, model = problem.simulated(self.study.fit)
         return replace(problem, posterior=replace(self.posterior, model=model))
 
+    def at_least(self, refinement: int) -> Problem:
+        """The same problem on blocks narrower by so much than the study's settings make them, or by more
+        where they are."""
+        return self if refinement <= self.refinement else self.refined(refinement // self.refinement)
+
     @cached_property
     def rough(self) -> Posterior:
         """The posterior on blocks up to four times wider, if those in use are narrower than the study's

@@ -12,7 +12,7 @@ from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.resolvedmodel import resolved
+from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
@@ -47,11 +47,10 @@ def off(state: State) -> float:
 
 def test_an_effect_has_the_blocks_that_it_asks_for(wide):
     state, own = wide
-    found, narrow = resolved(state, own)
+    narrow = narrowed_for(state, own)
+    found = moved(state, narrow)
     assert narrow.refinement > 1
     assert off(state) > 5.0
     assert off(found) < 3.0
     assert found.optimum.cost < state.optimum.cost - 10.0
-    again, same = resolved(found, narrow)
-    assert again is found
-    assert same is narrow
+    assert narrowed_for(found, narrow) is narrow
