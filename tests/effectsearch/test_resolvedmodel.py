@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from small import TRUTH, problem, record, row_values
+from small import TRUTH, problem, record, row_values, study
 
 from lcopa_bayes.bench.command import staircase
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
@@ -22,20 +25,28 @@ from lcopa_bayes.model.effects.dynamics import RiseFallAsymmetry
 SIZE, SD = 0.3, 2e-4
 
 
-@pytest.fixture(scope="module")
-def wide() -> tuple[State, Problem]:
-    """The optimum of an asymmetric plant on 100 blocks, and its problem; the record is of 3 200."""
-    command = staircase([1.0, -0.7, 0.4, 0.0], hold=3.0, start=0.35)
-    silent = record(1, command=command, camera=0.1, duration=14.0, noise_sd=0.0)
+def asymmetric(seed: int, levels: Sequence[float]) -> Record:
+    """The record of an asymmetric plant on 3 200 blocks."""
+    command = staircase(levels, hold=3.0, start=0.35)
+    silent = record(seed, command=command, camera=0.1, duration=14.0, noise_sd=0.0, name=f"r{seed}")
     own = problem(silent, blocks=100)
     fine, values = own.refined(32).posterior, row_values(own.posterior.table, TRUTH)
     exact = effected(fine, values, [RiseFallAsymmetry()]).responses(values, np.array([SIZE]))[0]
+    noise = SD * np.random.default_rng(seed).standard_normal(len(exact))
     seen = np.full(silent.response.shape, np.nan)
-    seen[~np.isnan(silent.response)] = exact[:, 0] + SD * np.random.default_rng(1).standard_normal(len(exact))
-    own = problem(replace(silent, response=seen), blocks=100)
+    seen[~np.isnan(silent.response)] = exact[:, 0] + noise
+    return replace(silent, response=seen)
+
+
+@pytest.fixture(scope="module")
+def wide() -> tuple[State, Problem]:
+    """The optimum of an asymmetric plant on 100 blocks, and its problem."""
+    seen = asymmetric(1, [1.0, -0.7, 0.4, 0.0])
+    own = problem(seen, blocks=100)
+    values = row_values(own.posterior.table, TRUTH)
     plain, white = ExtendedModel(own.posterior), Whitening(own.posterior.samples, (Law(SD),))
     x = plain.coordinates(values)
-    model = plain.at_scales(x, {silent.name: 0.0}).having(RiseFallAsymmetry())
+    model = plain.at_scales(x, {seen.name: 0.0}).having(RiseFallAsymmetry())
     optimum = Regression(model, white).descend(np.append(x, SIZE))
     return State(model, optimum, white), own
 
@@ -54,3 +65,16 @@ def test_an_effect_has_the_blocks_that_it_asks_for(wide):
     assert off(found) < 3.0
     assert found.optimum.cost < state.optimum.cost - 10.0
     assert narrowed_for(found, narrow) is narrow
+
+
+def test_a_loop_ends_on_the_blocks_that_its_effects_ask_for():
+    records = [asymmetric(1, [1.0, -0.7, 0.4, 0.0]), asymmetric(2, [-0.6, 0.9, -1.0, 0.5])]
+    unseen = asymmetric(3, [0.8, -1.0, 0.2, 0.9])
+    own = study(*records, held_out=[unseen], blocks=100)
+    found = loop(own, library=[RiseFallAsymmetry], sample=False, quick=True, as_stated=True)
+    assert found.verdict.kind == "explained"
+    assert found.problem.refinement > 1
+    assert found.base.optimum is found.before.state.optimum
+    model = found.after.state.model
+    assert model.plant.model is found.problem.posterior.model
+    assert off(found.after.state) < 3.0
