@@ -117,11 +117,14 @@ class Whitening:
 
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
-        out = np.empty_like(columns, dtype=float)
+        flat = columns.reshape(-1, columns.shape[-1])
+        out = np.zeros(flat.shape)
         for part, whiten in zip(self.parts, self._filters, strict=True):
-            own = columns[..., part.rows]
-            out[..., part.rows] = whiten(own.reshape(1, -1, own.shape[-1])).reshape(own.shape)
-        return out
+            own = flat[:, part.rows]
+            acting = own.any(axis=1)  # most tangents are those of other records and axes
+            if acting.any():
+                out[acting, part.rows] = whiten(own[acting][None])[0]
+        return out.reshape(columns.shape)
 
     def adjoint(self, columns: Matrix) -> Matrix:
         """Adjoint of whitening of columns (k, n), same shape [1 / response unit]."""

@@ -55,27 +55,17 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
         count = len(block) + len(series) + 1
         normal = np.zeros((batch, count, count))
         normal[:, range(len(block)), range(len(block))] = 1.0
-        noise = posterior.noise_parameters(values, axis)
+        noise, weights = posterior.noise_parameters(values, axis), np.append(sd, np.ones(len(series)))
         for r, samples in enumerate(posterior.samples):
             observed = samples.axes[axis]
             if observed.values.size == 0:
                 continue
-            stacked = np.zeros((batch, count, observed.values.size))
-            for position, k in enumerate(block):
-                column = posterior.column(k, axis, r, observed, units[r])
-                if column is not None:
-                    stacked[:, position] = sd[position] * column
-            for position, one in enumerate(series, start=len(block)):
-                if one.drive < 0:
-                    column = posterior.column(one.row, axis, r, observed, units[r])
-                elif posterior.model.experiments[r].drives[one.drive].moves:
-                    column = slopes[r][1][one.unit][one.position][:, observed.chosen]
-                else:
-                    column = None
-                if column is not None:
-                    stacked[:, position] = column
-            residual = posterior.residual(axis, r, observed, centre, units[r])
-            stacked[:, -1] = residual
+            found = _acting(posterior, axis, r, series, units[r], slopes[r][1])
+            acting = [*found, count - 1]
+            stacked = np.empty((batch, len(acting), observed.values.size))
+            for slot, (position, column) in enumerate(found.items()):
+                np.multiply(weights[position], column, out=stacked[:, slot])
+            stacked[:, -1] = residual = posterior.residual(axis, r, observed, centre, units[r])
             if isinstance(posterior.noise, GaussianNoise):
                 products, scale = posterior.noise.products(stacked, noise, observed.gaps)
                 total -= scale + 0.5 * observed.values.size * LOG_2PI
@@ -85,7 +75,7 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
                 weight = np.sqrt((nu + 1) / (nu + (residual / sigma[:, 0]) ** 2))
                 white = stacked / sigma * weight[:, None, :]
                 products = white @ white.swapaxes(1, 2)
-            normal += products
+            normal[:, np.array(acting)[:, None], acting] += products
         combine = np.zeros((batch, len(series), size))
         if block:
             inner, rest = normal[:, : len(block), : len(block)], normal[:, : len(block), len(block) :]
@@ -127,3 +117,23 @@ def _series(posterior: Posterior, axis: int, columns: Sequence[int]) -> list[_Se
         out += [_Series(k, drive, unit, position) for position, k in enumerate(table.shaping(unit))]
     out += [_Series(k) for k in posterior.acting[axis]]
     return [one for one in out if one.row in columns]
+
+
+def _acting(
+    posterior: Posterior,
+    axis: int,
+    r: int,
+    series: Sequence[_Series],
+    units: Array,
+    slopes: Sequence[Array],
+) -> dict[int, Array]:
+    """Columns of what is integrated out and of the `series` behind it that act on a record, by their
+    places, (batch or 1, samples); most offsets and the paths of drives at rest do not."""
+    block, observed = posterior.blocks[axis], posterior.samples[r].axes[axis]
+    out = {p: posterior.column(k, axis, r, observed, units) for p, k in enumerate(block)}
+    for position, one in enumerate(series, start=len(block)):
+        if one.drive < 0:
+            out[position] = posterior.column(one.row, axis, r, observed, units)
+        elif posterior.model.experiments[r].drives[one.drive].moves:
+            out[position] = slopes[one.unit][one.position][:, observed.chosen]
+    return {position: column for position, column in out.items() if column is not None}

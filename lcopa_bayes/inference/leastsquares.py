@@ -173,17 +173,19 @@ class LeastSquares:
         own = source[0][self.columns]  # position among sorted values of each search coordinate
         rows, prior = self._prior_rows(raw)
         misfits = np.concatenate([np.empty(posterior.size), prior])
-        jacobian = np.empty((len(own), misfits.size)).T  # a column of a long record is one piece of memory
+        jacobian = np.zeros((len(own), misfits.size)).T  # a column of a long record is one piece of memory
         jacobian[posterior.size :] = rows[:, self.columns]
         start = 0
         blocks = self.plain_slopes(values) if posterior.simulation is None else self._effected(values)
         for axis, observed, block, misfit in blocks:
             part = slice(start, start + observed.values.size)
             start = part.stop
-            stacked = np.concatenate([block.T[own], misfit[None]])
+            # offsets of other records and paths of other axes do not act
+            acting = np.flatnonzero(np.any(block[:, own], axis=0))
+            stacked = np.concatenate([block.T[own[acting]], misfit[None]])
             *slopes, misfits[part] = self._whiten(stacked, values, axis, observed.gaps)
-            for column, slope in zip(jacobian.T, slopes, strict=True):
-                column[part] = slope
+            for column, slope in zip(acting, slopes, strict=True):
+                jacobian[part, column] = slope
         for column, k in zip(jacobian[: posterior.size].T, self.columns, strict=True):
             row = table.rows[k]  # time slopes are in the logarithm already, other log scales are not
             if row.log_scale and row.kind != "time":

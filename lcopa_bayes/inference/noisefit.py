@@ -72,14 +72,24 @@ class NoiseFit:
     def log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of noise parameters (batch, names) up to a constant, (batch,)."""
         total = np.zeros(len(values))
-        for residual, gaps in zip(self.residuals, self.gaps, strict=True):
-            seen = np.broadcast_to(residual, (len(values), residual.size))
+        for residuals, gaps in self._alike:
             if isinstance(self.noise, GaussianNoise):
-                squares, scales = self.noise.products(seen[:, None], values, gaps)
-                total -= 0.5 * squares[:, 0, 0] + scales
+                seen = np.broadcast_to(residuals, (len(values), *residuals.shape))
+                squares, scales = self.noise.products(seen, values, gaps)
+                total -= 0.5 * np.trace(squares, axis1=1, axis2=2) + len(residuals) * scales
             else:
-                total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
+                for residual in residuals:
+                    seen = np.broadcast_to(residual, (len(values), residual.size))
+                    total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
         return total
+
+    @cached_property
+    def _alike(self) -> list[tuple[Matrix, Vector]]:
+        """Residuals of records with the same gaps, (records, n), and these: they are filtered together."""
+        alike: dict[bytes, list[int]] = {}
+        for number, gaps in enumerate(self.gaps):
+            alike.setdefault(np.asarray(gaps, dtype=float).tobytes(), []).append(number)
+        return [(np.stack([self.residuals[k] for k in own]), self.gaps[own[0]]) for own in alike.values()]
 
     def log_density(self, x: Matrix, template: Vector) -> Vector:
         """Log density of the coordinates up to a constant, (batch,)."""

@@ -15,7 +15,7 @@ from lcopa_bayes.data.record import Driven
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.grid import Mesh
-from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.layout import Layout, Unit
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response
 from lcopa_bayes.model.superposition import Changes, Phase, Superposition, blocks_of, phases
 
@@ -142,11 +142,13 @@ class ForwardModel:
     experiments: tuple[Experiment, ...]
     effects: Declared | None = None
     """Effects of the plant; unit responses are those of the plant without."""
+    axis: int | None = None
+    """The response axis that is asked for: unit responses that it has no part of are 0. None: all axes."""
 
     def only(self, *records: int) -> ForwardModel:
         """The same model of some of the records."""
         own = None if self.effects is None else self.effects.only(records)
-        return ForwardModel(self.layout, tuple(self.experiments[r] for r in records), own)
+        return replace(self, experiments=tuple(self.experiments[r] for r in records), effects=own)
 
     def path(self, response: int, drive: int) -> ForwardModel:
         """A plant of one path with one term, from a drive to a response, on the same records."""
@@ -158,7 +160,7 @@ class ForwardModel:
         own = None
         if self.effects is not None and other.effects is not None:
             own = self.effects.joined(other.effects)
-        return ForwardModel(self.layout, (*self.experiments, *other.experiments), own)
+        return replace(self, experiments=(*self.experiments, *other.experiments), effects=own)
 
     @property
     def plain(self) -> ForwardModel:
@@ -199,7 +201,7 @@ class ForwardModel:
         """Write the unit responses of a few plants into `out`."""
         read: dict[tuple[int, int, int, int], Array] = {}
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
-        for index, (element, delay, axis) in enumerate(self.layout.units):
+        for index, (element, delay, axis) in self._asked:
             proportional: list[tuple[int, float, Array]] = []
             for step, moved in self._moved[axis].items():
                 own = []
@@ -221,6 +223,13 @@ class ForwardModel:
                     out[number][index][:, self.experiments[number].mesh.reading.first :] = value
             for number, scale, one in proportional:
                 np.multiply(scale, one, out=out[number][index])
+
+    @cached_property
+    def _asked(self) -> list[tuple[int, Unit]]:
+        """Unit responses that are asked for, each with its place among all."""
+        units, paths = self.layout.units, self.layout.unit_of
+        own = range(len(units)) if self.axis is None else sorted(set(paths[self.axis]))
+        return [(index, units[index]) for index in own]
 
     @cached_property
     def _moved(self) -> list[dict[float, list[int]]]:
@@ -259,7 +268,7 @@ class ForwardModel:
         used = {
             (unit.element, experiment.mesh.lattice.step)
             for experiment in self.experiments
-            for unit in self.layout.units
+            for _, unit in self._asked
             if experiment.phases[unit.drive]
         }
         groups: dict[tuple[int, int], list[tuple[int, float]]] = {}
@@ -302,20 +311,19 @@ class ForwardModel:
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
         batch, sizes = dynamics.batch, [e.mesh.reading.samples for e in self.experiments]
         values = [np.zeros((len(self.layout.units), batch, size)) for size in sizes]
-        slopes: list[list[Array]] = [[] for _ in sizes]
-        for index, (element, delay, axis) in enumerate(self.layout.units):
+        rows = [2 * dynamics.times[unit.element].shape[1] + 1 for unit in self.layout.units]
+        slopes = [[np.zeros((each, batch, size)) for each in rows] for size in sizes]
+        for index, (element, delay, axis) in self._asked:
             terms = dynamics.times[element].shape[1]
-            for own, size in zip(slopes, sizes, strict=True):
-                own.append(np.zeros((2 * terms + 1, batch, size)))
             for step, moved in self._moved[axis].items():
                 response = self._step_response(dynamics, element, step, known, slopes=wanted)
                 records, late = [self.experiments[k].changes[axis] for k in moved], dynamics.delays[:, delay]
                 superpose = partial(superposed[step], records=records, delays=late, key=(element, delay))
                 found, by_block = superpose(response), superpose(response.alone, kind="slope")
-                for number, rows, slope in zip(moved, found, by_block, strict=True):
+                for number, one, slope in zip(moved, found, by_block, strict=True):
                     first, target = self.experiments[number].mesh.reading.first, slopes[number][index]
-                    values[number][index][:, first:] = rows[0]
-                    target[: len(rows) - 1, :, first:] = rows[1:]
+                    values[number][index][:, first:] = one[0]
+                    target[: len(one) - 1, :, first:] = one[1:]
                     target[-1:, :, first:] = -slope / step
                     if not in_orders:
                         target[terms:-1] = np.nan

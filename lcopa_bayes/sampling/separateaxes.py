@@ -78,7 +78,7 @@ def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
     """The factor of each response axis; none where axes share a parameter, or some are without samples.
 
     In each of them the parameters of the others are fixed at those of table `values`, (rows,), which it does
-    not depend on, and their samples are left out.
+    not depend on, and their samples are left out, as are their responses.
     """
     table = posterior.table
     acting = [table.acting_on(k) for k in range(len(table.rows))]
@@ -94,7 +94,8 @@ def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
             for row, own, value in zip(table.rows, acting, values, strict=True)
         )
         samples = tuple(_of_axis(one, axis) for one in posterior.samples)
-        out.append(replace(posterior, table=replace(table, rows=rows), samples=samples))
+        model = replace(posterior.model, axis=axis)
+        out.append(replace(posterior, table=replace(table, rows=rows), samples=samples, model=model))
     return tuple(out)
 
 
