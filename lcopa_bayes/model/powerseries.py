@@ -111,11 +111,11 @@ def transfer(times: Array, integrals: Integrals, circle: Circle, *, corrected: b
 
     Parameters: times (..., batch, terms) [blocks]; `integrals` of the elements' orders. Returns: (...,
     batch, length // 2 + 1).
-    Accuracy: the dense matrix quotient to 2e-9 (typically 1e-12); the true response to O(h^2) in the width h
-    of a block, corrected to O(h^3) or better for orders above 0.8, and below to typically a fifth. Useless
-    for an element whose time constants are all below about 0.3 blocks (corrected and undamped, of order 2,
-    below 3 blocks) when its top order exceeds 1: the block-pulse scheme is then unstable and needs shorter
-    blocks.
+    Accuracy: the dense matrix quotient to 4e-9 of its largest (typically 1e-12); the true response to O(h^2)
+    in the width h of a block, corrected to O(h^3) or better for orders above 0.8, and below to typically a
+    fifth. Useless for an element whose time constants are all below about 0.3 blocks (corrected and
+    undamped, of order 2, below 3 blocks) when its top order exceeds 1: the block-pulse scheme is then
+    unstable and needs shorter blocks.
     """
     top, denominator, *_ = _parts(times, integrals, circle, corrected)
     inverse = np.divide(1.0, denominator, out=denominator)

@@ -54,6 +54,20 @@ def test_the_level_of_a_piece_is_integrated_out_as_by_a_dense_covariance():
     assert_allclose(np.diff(totals), np.diff(exact), rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [("white+ar1", [[0.7, 0.5, 0.9], [1.1, 0.2, 0.4]]), ("student", [[0.7, 4.0], [1.1, 9.0]])],
+)
+def test_residuals_of_records_sampled_alike_count_as_one_by_one(kind: str, parameters: list[list[float]]):
+    rng, noise, values = np.random.default_rng(2), NOISES[kind](), np.array(parameters)
+    even, uneven = np.ones(30), rng.uniform(0.5, 4.0, 30)
+    gaps = [even, uneven, even.copy(), even[:20], uneven.copy(), even]
+    residuals = [rng.standard_normal(one.size) for one in gaps]
+    alone = [NoiseFit(noise, (), [residual], [own]) for residual, own in zip(residuals, gaps, strict=True)]
+    one_by_one = sum(one.log_likelihood(values) for one in alone)
+    assert_allclose(NoiseFit(noise, (), residuals, gaps).log_likelihood(values), one_by_one, rtol=1e-12)
+
+
 def test_estimates_at_rest_are_calibrated():
     """Over 300 truths from the priors of the estimate; its scale is free, so that one scale serves."""
     rng, inside, standard = np.random.default_rng(4), [], []

@@ -428,6 +428,22 @@ def test_slopes_without_orders_are_the_same_times_and_delays(rng):
             assert np.isnan(parts[index][2:4]).any() == value[index].any(), unit
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("share", ["none", "paper"])
+def test_an_axis_that_is_asked_for_alone_responds_as_among_all(rng, share, axis):
+    model, dynamics = two_axes(share, "path", rng)
+    alone, own = replace(model, axis=axis), set(model.layout.unit_of[axis])
+    both = zip(alone.unit_slopes(dynamics), model.unit_slopes(dynamics), strict=True)
+    for (value, slopes), (wanted, every) in both:
+        for index in range(len(model.layout.units)):
+            part = float(index in own)
+            assert_allclose(value[index], part * wanted[index], rtol=0, atol=1e-12)
+            assert_allclose(slopes[index], part * every[index], rtol=0, atol=1e-12)
+    for value, wanted in zip(alone.unit_responses(dynamics), model.unit_responses(dynamics), strict=True):
+        for index in range(len(model.layout.units)):
+            assert_allclose(value[index], float(index in own) * wanted[index], rtol=0, atol=1e-12)
+
+
 def test_slopes_of_a_resting_drive_are_zero(rng):
     model, dynamics = two_axes("paper", "shared", rng)
     value, parts = model.unit_slopes(dynamics)[1]

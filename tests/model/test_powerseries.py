@@ -48,8 +48,8 @@ drives = st.builds(
 @settings(max_examples=200, deadline=None)
 @given(element=elements(), drive=drives, step=st.floats(-3, 1))
 def test_quotient_is_the_dense_solution(element, drive, step):
-    """Where the scheme is stable by a margin: elsewhere the dense solution grows without bound. Responses that
-    ring on beyond the records alias by up to 4e-9 of the largest."""
+    """Where the scheme is stable by a margin: elsewhere the dense solution grows without bound. What rings
+    on beyond the records aliases by up to 4e-9 of the largest."""
     impulse = np.eye(1, max(100, 2 * drive.size))[0]
     assume(np.abs(dense(*element, impulse, 10.0**step)).max() < 1.5)
     exact = dense(*element, drive, 10.0**step)
