@@ -203,7 +203,9 @@ def _weights(log_density: Matrix, alpha: float) -> tuple[Matrix, float]:
     log_weights, k = smoothed((alpha - 1) * log_density.ravel(), r_eff=r_eff)
     if np.isnan(k):  # many equal largest weights, as of a density with a plateau
         return np.exp(log_weights).reshape(log_density.shape), k
-    weights = np.exp(array_stats.power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))  # type: ignore[no-untyped-call]
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # no finite tail: k is far above 1
+        log_scaled = array_stats.power_scale_lw(log_density, alpha=alpha, axis=(0, 1))  # type: ignore[no-untyped-call]
+    weights = np.exp(log_scaled if np.isfinite(log_scaled).all() else log_weights.reshape(log_density.shape))
     return weights / weights.sum(), k
 
 

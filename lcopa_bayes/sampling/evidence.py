@@ -72,13 +72,14 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
     """Log evidence from draws (ensembles, walkers, draws, dimension); None for a single ensemble.
 
     None too where the mixture of some ensembles meets no density: they have not reached what the others have.
-    `ess` is the smallest effective sample size of all the draws. Deterministic given `seed`.
+    `ess` is the smallest effective sample size of all the draws; NaN where walkers hardly moved, so that an
+    ensemble counts as one draw. Deterministic given `seed`.
     """
     ensembles, dimension = coordinates.shape[0], coordinates.shape[-1]
     if ensembles < 2:
         return None
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=(2_000,))))
-    chart = Chart.of(posterior)
+    chart, each = Chart.of(posterior), ess / ensembles if np.isfinite(ess) else 1.0
     pools = [chart.usable(spread_evenly(draws.reshape(-1, dimension), _BRIDGED)) for draws in coordinates]
     estimates = []
     for k, (pool, y, log_volume) in enumerate(pools):
@@ -89,7 +90,7 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
         other = charted_density(posterior, chart, drawn) - mixture.log_density(drawn)
         if not (other > -np.inf).any():
             return None
-        estimates.append(bridge(own - mixture.log_density(y), other, ess / ensembles))
+        estimates.append(bridge(own - mixture.log_density(y), other, each))
     values = [value for value, _ in estimates]
     spread = float(np.std(values, ddof=1))
     claimed = float(np.sqrt(np.mean([error**2 for _, error in estimates])))

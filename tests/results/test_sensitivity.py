@@ -124,6 +124,16 @@ def test_uneven_importance_weights_are_not_trusted(rng):
     assert found.as_json()["likelihood"] is None
 
 
+@pytest.mark.parametrize("least", [1e5, 1e6, 1e8])
+def test_draws_that_have_not_arrived_are_not_trusted(rng, least):
+    """Walkers far below the mode still: a few draws have all the weight, and their tail has no finite fit."""
+    climbing = rng.permutation(-np.geomspace(1.0, least, 400)).reshape(2, 200)
+    values = rng.standard_normal((2, 200, 1))
+    (found,) = power_scaled(["x"], values, climbing, climbing, ["unusable"])
+    assert found.diagnosis == "not trusted"
+    assert np.isnan(found.prior)
+
+
 def test_too_few_draws_are_not_trusted(rng):
     (found,) = power_scaled(["x"], *stacked(gaussian(rng, seen=0.0, size=(2, 20))), ["unusable"])
     assert found.diagnosis == "not trusted"

@@ -170,6 +170,16 @@ def test_two_bounded_parameters_against_quadrature():
     assert again == reported
 
 
+def test_draws_of_unknown_worth_count_as_one_of_each_ensemble():
+    """Walkers that hardly moved have no effective sample size."""
+    posterior, mean, sd, exact = linear_gaussian()
+    draws = mean + sd * np.random.default_rng(0).standard_normal((3, 10, 40, 1))
+    unknown, known = (evidence(posterior, draws, ess, 1) for ess in (float("nan"), 3.0))
+    assert unknown is not None
+    assert unknown == known
+    assert abs(unknown.value - exact) < 4.5 * unknown.sd
+
+
 def test_a_single_ensemble_has_no_evidence():
     posterior, mean, sd, _ = linear_gaussian()
     draws = mean + sd * np.random.default_rng(0).standard_normal((1, 10, 25, 1))
