@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.plot.rundata import RunData
 from lcopa_bayes.plot.theme import (
     BAND,
@@ -32,6 +33,8 @@ IN_CORNER = 8
 """Most parameters on one corner plot."""
 _LABELS = 0.47
 """Distance of an axis label from its panel [in]."""
+_NARROW = 1e-9
+"""Range of values over their magnitude below which they are alike [-]."""
 MIDDLE = 0.995
 """Share of the draws that each axis of the corner plot spans [-]."""
 
@@ -138,10 +141,18 @@ def draw_prior(panel: Axes, run: RunData, name: str) -> None:
     x, height = own["x"].to_numpy(), own["density"].to_numpy()
     draws = run.draws[name].ravel()
     log = run.is_log(name)
-    counts, edges = np.histogram(np.log(draws) if log else draws, bins=_BINS, density=True)
+    draws = np.log(draws) if log else draws
+    counts, edges = np.histogram(draws, bins=_BINS, range=_reach(draws), density=True)
     panel.stairs(counts, np.exp(edges) if log else edges, fill=True, color=BAND, alpha=0.5, label="draws")
     panel.plot(x, height, color=HELD_OUT, label="prior")
     _density_axis(panel, log=log)
+
+
+def _reach(values: Vector) -> tuple[float, float]:
+    """Ends of a histogram of values; of those that differ by rounding alone wide enough for bins."""
+    low, high = float(values.min()), float(values.max())
+    short = max(0.0, _NARROW * max(abs(low), abs(high)) - (high - low))
+    return low - short / 2, high + short / 2
 
 
 def draw_methods(panel: Axes, run: RunData, name: str) -> None:

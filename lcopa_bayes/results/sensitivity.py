@@ -210,7 +210,9 @@ def _weights(log_density: Matrix, alpha: float) -> tuple[Matrix, float]:
 
 
 def _distances(values: Array, lower: Matrix, upper: Matrix) -> Vector:
-    """Sensitivity of each parameter given the weights at both powers, (parameters,)."""
+    """Sensitivity of each parameter given the weights at both powers, (parameters,); NaN of one that has
+    not moved."""
+    moved = np.ptp(values, axis=(0, 1)) > 0
     return np.array(
         [
             float(
@@ -218,6 +220,8 @@ def _distances(values: Array, lower: Matrix, upper: Matrix) -> Vector:
                     values[..., k], lower, upper, lower_alpha=ALPHAS[0], upper_alpha=ALPHAS[1]
                 )
             )
+            if moved[k]
+            else np.nan
             for k in range(values.shape[-1])
         ]
     )

@@ -14,6 +14,7 @@ from small import record, study
 import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.paper.staticoptics import OpticsPlan
+from lcopa_bayes.plot.draws import _reach
 from lcopa_bayes.plot.records import record_figure
 from lcopa_bayes.plot.theme import BAND, StyledFigure, look
 from lcopa_bayes.report.svg import svg_of
@@ -69,6 +70,17 @@ def test_residuals_are_those_of_the_fit(fit):
     points = lb.plot.residuals(fit, record="on").axes[0].lines[1].get_data()
     own = next(one for one in fit.residuals if not one.held_out)
     np.testing.assert_allclose(np.column_stack(points), np.column_stack([own.time, own.values]))
+
+
+@pytest.mark.parametrize("values", [0.3 + 1e-16 * np.arange(4), np.zeros(4), np.full(4, -1e9)])
+def test_draws_that_are_alike_have_a_histogram(values):
+    counts, _ = np.histogram(values, bins=30, range=_reach(values))
+    assert counts.sum() == values.size
+
+
+def test_a_histogram_of_other_draws_ends_at_them(rng):
+    values = rng.normal(5.0, 1e-3, 100)
+    assert _reach(values) == (values.min(), values.max())
 
 
 def test_a_forest_has_a_row_for_every_parameter_at_its_interval(fit):

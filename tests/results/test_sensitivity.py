@@ -134,6 +134,17 @@ def test_draws_that_have_not_arrived_are_not_trusted(rng, least):
     assert np.isnan(found.prior)
 
 
+def test_a_parameter_that_has_not_moved_is_not_trusted(rng):
+    x, prior, likelihood = gaussian(rng, seen=1.0)
+    values = np.stack([x, np.full(x.shape, 0.3)], axis=-1)
+    found = power_scaled(["x", "still"], values, prior, likelihood, ["reliable", "unusable"])
+    by_name = {one.parameter: one for one in found}
+    assert by_name["still"].diagnosis == "not trusted"
+    assert np.isnan(by_name["still"].prior)
+    (alone,) = power_scaled(["x"], x[..., None], prior, likelihood, ["reliable"])
+    assert by_name["x"].prior == alone.prior
+
+
 def test_too_few_draws_are_not_trusted(rng):
     (found,) = power_scaled(["x"], *stacked(gaussian(rng, seen=0.0, size=(2, 20))), ["unusable"])
     assert found.diagnosis == "not trusted"
