@@ -11,7 +11,7 @@ import numpy as np
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.explained import coordinates_of
 from lcopa_bayes.effectsearch.heldouteffects import missed, share_beyond_noise, unseen_share
-from lcopa_bayes.effectsearch.heldoutscores import unseen_scores
+from lcopa_bayes.effectsearch.heldoutscores import given_their_records, unseen_scores
 from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.outliers import Outlying, without_outliers
 from lcopa_bayes.effectsearch.rounds import Search
@@ -75,7 +75,7 @@ class Side:
 def predicts_better(problem: Problem, larger: State, smaller: State) -> bool:
     """Whether a model takes a part of the squared error beyond noise that one with fewer effects leaves on
     unseen records, where that leaves any."""
-    was, now = (unseen_scores(state, problem) for state in (smaller, larger))
+    was, now = (given_their_records(unseen_scores(each, problem), each) for each in (smaller, larger))
     return not share_beyond_noise(problem.study, was, now, larger) > CONFIRMED
 
 
@@ -100,7 +100,7 @@ def findings_of(
     generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
     added, names = searched.state.model.effects, named_effects(searched.state)
     by_record = bool(added) and all(effect.card.per_record for effect in added)
-    was, now = before.unseen, after.unseen
+    was, now = (tuple(given_their_records(side.unseen, side.state)) for side in (before, after))
     if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
         was, now = without_outliers(was, now)
     return Findings(
@@ -126,6 +126,9 @@ def findings_of(
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
         risen=np.nan if by_record else risen(was, now),
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
+        varying=tuple(
+            effect.name for effect in added if effect.card.per_record and study.held_out and not by_record
+        ),
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )
 

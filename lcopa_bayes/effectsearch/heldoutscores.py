@@ -3,10 +3,13 @@ its rule, or with fitted ones left out in turn."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.effectsearch.basefit import fitted_scales
 from lcopa_bayes.effectsearch.drawsabout import likely_draws
 from lcopa_bayes.effectsearch.leavingout import left_out_scores
 from lcopa_bayes.effectsearch.scores import Score, State, score_of
@@ -61,8 +64,47 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         mean = plant[bounded].mean(axis=0) + level[bounded].mean()
         apart = (seen + level[:, None])[bounded]
         one = score_of(state, record, axis, (mean, apart.var(axis=0)), source, held_out=True)
-        out.append(replace(one, draws=apart - apart.mean(axis=0)))
+        varied = None if seen is plant else (seen - plant)[bounded]
+        out.append(replace(one, draws=apart - apart.mean(axis=0), varied=varied))
     return out
+
+
+def given_their_records(scores: Sequence[Score], state: State) -> list[Score]:
+    """Predictions given what each record itself says of what differs from record to record, such as when its
+    trigger came: no other record tells that, and an error by it says nothing of the model.
+
+    By the gain of a Kalman filter whose covariance is that of the draws (Burgers, van Leeuwen and Evensen
+    1998, Mon. Weather Rev. 126).
+    """
+    return [one if one.varied is None else _given_its_record(one, one.varied, state) for one in scores]
+
+
+def _given_its_record(score: Score, varied: Matrix, state: State) -> Score:
+    assert score.draws is not None
+    axes = [axis.name for axis in state.model.plant.table.layout.responses]
+    law = state.whitening.weighed[axes.index(score.axis)]
+    gaps = np.diff(score.time, prepend=np.nan) / fitted_scales(state.model.plant).period
+    gaps[0] = 1.0
+    columns = (varied - varied.mean(axis=0)) / np.sqrt(len(varied))
+    white = law.whiten(columns, gaps)
+    inner = white @ white.T + np.eye(len(white))
+
+    def taken(residual: Matrix) -> Matrix:
+        """What of residuals (batch, n) is put down to it."""
+        return np.asarray(np.linalg.solve(inner, white @ law.whiten(residual, gaps).T).T @ columns)
+
+    noise = WhiteAR1().draw(
+        np.tile(law.parameters, (len(varied), 1)), gaps, np.random.default_rng([_STREAM, score.time.size])
+    )
+    draws = score.draws - taken(score.draws + noise)
+    draws -= draws.mean(axis=0)
+    return replace(
+        score,
+        predicted=score.predicted + taken((score.observed - score.predicted)[None])[0],
+        variance=score.variance - score.draws.var(axis=0) + draws.var(axis=0),
+        draws=draws,
+        varied=None,
+    )
 
 
 def _about_optimum(state: State, seed: int) -> tuple[Draws, Noise]:

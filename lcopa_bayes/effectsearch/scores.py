@@ -42,6 +42,9 @@ class Score:
     level_from: str
     draws: Matrix | None = None
     """Draws of the prediction less their mean, (draws, n) [response unit]; None where none were taken."""
+    varied: Matrix | None = None
+    """What effects that differ from record to record add in these draws, (draws, n) [response unit]; None
+    without any."""
 
     @property
     def half_width(self) -> Vector:

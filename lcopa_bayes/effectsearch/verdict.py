@@ -10,6 +10,7 @@ from typing import Literal, final
 from scipy.stats import norm
 
 from lcopa_bayes.core.estimate import HALF_WIDTH
+from lcopa_bayes.core.wording import listed
 
 Kind = Literal["clean", "explained", "partly explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
@@ -158,6 +159,8 @@ class Findings:
     reached: float = math.nan
     """Largest error of any axis on unseen records over the noise, with the effects [-]; NaN where these
     differ from record to record."""
+    varying: tuple[str, ...] = ()
+    """Effects that differ from record to record, given which held-out records were judged."""
     nothing: float = 1.0
     """Probability that nothing more is missing, by the last residual [-]."""
     linear: Dynamics | None = None
@@ -198,6 +201,11 @@ def decide(given: Findings) -> Verdict:
         verb = "disturbs" if one else "disturb"
         said = f"{named} {verb} the records; the plant stays as it is, the noise model changes."
         return Verdict("disturbance", confidence, said + rest)
+    if given.varying:
+        rest += (
+            f" Given {listed(given.varying)} of each held-out record, which no other record tells, the error "
+            f"there is {given.reached:.2f} times the noise."
+        )
     return Verdict("explained", confidence, f"{said}, worth {given.gained:.0f} nat." + rest)
 
 

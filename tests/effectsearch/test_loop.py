@@ -387,6 +387,12 @@ def test_the_verdict_follows_from_what_was_found(change, kind):
     assert decide(replace(FOUND, **change)).kind == kind
 
 
+def test_a_verdict_says_given_what_held_out_records_were_judged():
+    said = decide(replace(FOUND, effects=("a", "b"), varying=("b",), reached=1.02)).sentence
+    assert "Given b of each held-out record, which no other record tells, the error there is 1.02" in said
+    assert "Given" not in decide(replace(FOUND, reached=1.02)).sentence
+
+
 def test_an_alarm_of_the_trace_must_hold_against_the_refit():
     """Straight lines gave 3.3 nat where chance gives 3.2; what was not refitted keeps what they gave."""
 
