@@ -75,7 +75,7 @@ class Side:
 def predicts_better(problem: Problem, larger: State, smaller: State) -> bool:
     """Whether a model takes a part of the squared error beyond noise that one with fewer effects leaves on
     unseen records, where that leaves any."""
-    was, now = (given_their_records(unseen_scores(each, problem), each) for each in (smaller, larger))
+    was, now = (unseen_scores(state, problem) for state in (smaller, larger))
     return not share_beyond_noise(problem.study, was, now, larger) > CONFIRMED
 
 
@@ -100,7 +100,11 @@ def findings_of(
     generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
     added, names = searched.state.model.effects, named_effects(searched.state)
     by_record = bool(added) and all(effect.card.per_record for effect in added)
-    was, now = (tuple(given_their_records(side.unseen, side.state)) for side in (before, after))
+    was, now, varying = before.unseen, after.unseen, tuple[str, ...]()
+    # where something remains, what is free in every record takes up some of it in these too
+    if study.held_out and not last.alarmed and not by_record:
+        varying = tuple(effect.name for effect in added if effect.card.per_record)
+        now = tuple(given_their_records(now, searched.state))
     if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
         was, now = without_outliers(was, now)
     return Findings(
@@ -126,9 +130,7 @@ def findings_of(
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
         risen=np.nan if by_record else risen(was, now),
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
-        varying=tuple(
-            effect.name for effect in added if effect.card.per_record and study.held_out and not by_record
-        ),
+        varying=varying,
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )
 
