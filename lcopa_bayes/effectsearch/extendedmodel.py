@@ -17,7 +17,6 @@ from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior, bounded
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
-from lcopa_bayes.model.effects.simulator import Latest
 
 _MERGED = 1e-6
 """Orders closer than this are at the end of their support [-]."""
@@ -57,15 +56,14 @@ class ExtendedModel:
         A base fit that lacks an effect has gains that are wrong on one axis more than on another, and one
         coefficient for all axes then fits none of them.
         """
-        simulator, values = self.effected.simulator, self.values(x)[: len(self.plant.table.rows)]
-        own = effected(self.plant, values, (), simulator.epochs).ranges.response
-        factor = np.exp(np.mean(np.log(simulator.ranges.response / own)))
-        return self.with_ranges(replace(simulator.ranges, response=factor * own))
+        ranges, values = self.effected.ranges, self.values(x)[: len(self.plant.table.rows)]
+        own = effected(self.plant, values).ranges.response
+        factor = np.exp(np.mean(np.log(ranges.response / own)))
+        return self.with_ranges(replace(ranges, response=factor * own))
 
     def with_ranges(self, ranges: Ranges) -> ExtendedModel:
         """With the effects at other scales."""
-        simulator = replace(self.effected.simulator, ranges=ranges, still=Latest())
-        return replace(self, scaled=replace(self.effected, simulator=simulator))
+        return replace(self, scaled=self.effected.with_ranges(ranges))
 
     @property
     def effected(self) -> Effected:

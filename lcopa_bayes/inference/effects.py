@@ -105,6 +105,10 @@ class Effected:
             self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
         )
 
+    def with_ranges(self, ranges: Ranges) -> Effected:
+        """The same at other scales."""
+        return replace(self, simulator=replace(self.simulator, ranges=ranges, still=Latest()))
+
     def on(self, model: ForwardModel) -> Effected:
         """The same on other blocks."""
         simulator = replace(self.simulator, model=model, step_responses=Latest(), still=Latest())

@@ -79,7 +79,8 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
     if ensembles < 2:
         return None
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=(2_000,))))
-    chart, each = Chart.of(posterior), ess / ensembles if np.isfinite(ess) else 1.0
+    chart = Chart.of(posterior)
+    own_ess = ess / ensembles if np.isfinite(ess) else 1.0
     pools = [chart.usable(spread_evenly(draws.reshape(-1, dimension), _BRIDGED)) for draws in coordinates]
     estimates = []
     for k, (pool, y, log_volume) in enumerate(pools):
@@ -90,7 +91,7 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
         other = charted_density(posterior, chart, drawn) - mixture.log_density(drawn)
         if not (other > -np.inf).any():
             return None
-        estimates.append(bridge(own - mixture.log_density(y), other, each))
+        estimates.append(bridge(own - mixture.log_density(y), other, own_ess))
     values = [value for value, _ in estimates]
     spread = float(np.std(values, ddof=1))
     claimed = float(np.sqrt(np.mean([error**2 for _, error in estimates])))

@@ -10,11 +10,11 @@ import pytest
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.findings import predicts_better, unfollowed
+from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
+from lcopa_bayes.effectsearch.findings import Side, findings_of, predicts_better, unfollowed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
-from lcopa_bayes.effectsearch.rounds import search
+from lcopa_bayes.effectsearch.rounds import Search, search
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.sampling.convergence import Grade
 
@@ -46,6 +46,13 @@ def study(seed: int, rest: int = 30) -> Study:
     return Study("modes", None, "ms", seed, tuple(records[:2]), tuple(records[2:]), ModelSettings(terms=2))
 
 
+def judged_given(base: Base, searched: Search) -> tuple[str, ...]:
+    """Effects that held-out records are taken to say of themselves."""
+    before, after = (Side.of(base.problem, state) for state in (base.start, searched.state))
+    own = base.problem.study
+    return findings_of(own, searched, before, after, outliers=None, cautions=(), alone=False).varying
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_an_effect_that_unseen_records_do_not_confirm_is_taken_back(seed: int) -> None:
     """Amplitudes of a flicker are free in every record, and take up some of what a resonance leaves."""
@@ -67,6 +74,10 @@ def test_an_effect_that_unseen_records_do_not_confirm_is_taken_back(seed: int) -
     assert found.rounds[-1].alarmed
     assert found.groups == (("extra_mode",),)
     assert 0 < found.gained < unasked.gained
+    assert judged_given(base, unasked) == ()  # it would take up what the resonance leaves there too
+    last = unasked.rounds[-1]
+    quiet = replace(last, trace=replace(last.trace, threshold=np.inf))
+    assert judged_given(base, replace(unasked, rounds=(*unasked.rounds[:-1], quiet))) == ("flicker",)
 
 
 def test_an_effect_that_is_there_predicts_better() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_triangular
@@ -38,6 +38,7 @@ def elements(draw: st.DrawFn, most: int = 6) -> tuple[np.ndarray, np.ndarray]:
     return 10.0 ** np.array(times), np.array(orders)
 
 
+RINGING = np.array([0.45315836, 1.0]), np.array([2.0, 0.01171875])
 drives = st.builds(
     lambda n, seed: np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], n),
     st.integers(1, 300),
@@ -47,14 +48,15 @@ drives = st.builds(
 
 @settings(max_examples=200, deadline=None)
 @given(element=elements(), drive=drives, step=st.floats(-3, 1))
+@example(RINGING, np.random.default_rng(0).choice([-1.0, 0.0, 1.0], 122), 0.0)
 def test_quotient_is_the_dense_solution(element, drive, step):
-    """Where the scheme is stable by a margin: elsewhere the dense solution grows without bound. What rings
-    on beyond the records aliases by up to 4e-9 of the largest."""
+    """Where the scheme is stable by a margin: elsewhere the dense solution grows without bound. The example,
+    which rings on beyond its record, is the worst that was found: 3.4e-9."""
     impulse = np.eye(1, max(100, 2 * drive.size))[0]
     assume(np.abs(dense(*element, impulse, 10.0**step)).max() < 1.5)
     exact = dense(*element, drive, 10.0**step)
     scale = max(1.0, float(np.abs(exact).max()))
-    assert_allclose(fast(*element, drive, 10.0**step), exact, rtol=0, atol=1e-8 * scale)
+    assert_allclose(fast(*element, drive, 10.0**step), exact, rtol=0, atol=4e-9 * scale)
 
 
 @pytest.mark.parametrize("order", [1.9, 1.99, 2.0])
