@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from math import floor, isfinite, log10
+from math import isfinite
 from typing import Any
 
 from lcopa_bayes.core.estimate import HALF_WIDTH
@@ -30,7 +30,7 @@ def figures(value: float | None, count: int = 3) -> str:
         return NONE
     if value == 0:
         return "0"
-    return _printed(value, count - 1 - floor(log10(abs(float(f"{value:.{count - 1}e}")))))
+    return _printed(value, count - 1 - _power_of_ten(value, count))
 
 
 def to_spread(value: float | None, spread: float | None) -> str:
@@ -113,18 +113,24 @@ def stopped(clause: str) -> str:
 
 def _place(value: float) -> int:
     """Decimal places that show two significant digits."""
-    return 1 - floor(log10(abs(float(f"{value:.1e}"))))
+    return 1 - _power_of_ten(value, 2)
+
+
+def _power_of_ten(value: float, count: int) -> int:
+    """Of `value` rounded to `count` digits: read off its decimals, as no quotient and no logarithm ends for
+    the least and the largest numbers."""
+    return int(f"{value:.{count - 1}e}".partition("e")[2])
 
 
 def _printed(value: float, places: int) -> str:
     size = abs(value)
     if value != 0 and not _PLAIN_FROM <= size < _PLAIN_TO:
-        power = floor(log10(size))
-        mantissa = f"{value / 10.0**power:.{max(0, min(15, power + places))}f}"
-        if abs(float(mantissa)) >= 10:
-            power += 1
-            mantissa = f"{value / 10.0**power:.{max(0, min(15, power + places))}f}"
-        text = f"{mantissa}×10{str(power).translate(_RAISED)}"  # noqa: RUF001
+        below = _power_of_ten(value, 17)
+        decimals = max(0, min(15, below + places))
+        mantissa, _, power = f"{value:.{decimals}e}".partition("e")
+        if int(power) > below:  # rounded up to the next power, whose mantissa has one decimal more
+            mantissa = f"{float(mantissa):.{max(0, min(15, int(power) + places))}f}"
+        text = f"{mantissa}×10{str(int(power)).translate(_RAISED)}"  # noqa: RUF001
     else:
         text = f"{round(value, places):.{max(0, places)}f}"
     return signed(text)

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from decimal import Decimal
 from functools import partial
 from html import unescape
 from html.parser import HTMLParser
@@ -13,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from small import record, study
@@ -494,6 +495,17 @@ def test_intervals_and_significant_digits():
     assert interval(0.02838, None, 0.015) == "0.028 to open"
     assert interval(None, None, None, nothing=NOT_REACHED) == NOT_REACHED
     assert [figures(x) for x in (0.0, 0.99996, 123456.0, float("inf"))] == ["0", "1.00", "123000", "–"]  # noqa: RUF001
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=True), st.integers(1, 6))
+@example(5e-324, 2).via("no power of ten divides it: it was 0")
+@example(1.7976931348623157e308, 3).via("rounded up it is no number any more")
+@example(-9.996e-5, 3).via("rounded up to the next power of ten")
+def test_every_number_is_printed_to_its_digits(value, count):
+    """Read again, what is printed is the number that Python rounds to so many digits."""
+    printed = figures(value, count).translate(str.maketrans("−⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "--0123456789"))  # noqa: RUF001
+    assert Decimal(printed.replace("×10", "e")) == Decimal(f"{value:.{count - 1}e}")  # noqa: RUF001
+    assert to_spread(value, abs(value)) == figures(value, 2)
 
 
 def test_powers_of_ten_in_sentences_are_raised_or_written_in_full():
