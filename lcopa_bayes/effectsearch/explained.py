@@ -33,9 +33,11 @@ from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _DRAWS, _STREAM = 100, 13
 """Normal draws about an optimum [-], and the mark of their randomness."""
-SEARCH = 150.0
-"""Time for draws by a search, where the study states none [s]. That of three response axes took 77 s with two
-processes and gave reliable ones; ended after 40 s it gave none, and what is tried then took longer."""
+LIMIT = 150.0
+"""Time for draws by a search, and for those around optima, where the study states none [s]. A search of three
+response axes took 77 s with two processes and gave reliable draws; ended after 40 s it gave none, and what is
+tried then took longer. Around the optimum of a plant far from its records proposals were fitted for ten
+minutes without it."""
 _SEARCHED = 6_000
 """Most samples of a plant that is searched [-]: of 10 700 of two axes a search took seven minutes of one
 processor, and ended without draws of the second axis."""
@@ -149,6 +151,7 @@ def _sampled(
     often. It takes minutes, and is left to a fit, of many samples and under noise that is not Gaussian, where
     gains and offsets are searched too."""
     posterior, plan = problem.posterior, plan_of(problem, quick=False)
+    plan = replace(plan, seconds=LIMIT if plan.seconds is None else plan.seconds)
     around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima)
     plain = posterior.simulation is None and isinstance(posterior.noise, GaussianNoise)
     if not (plain and optima):
@@ -156,8 +159,7 @@ def _sampled(
     first = around(attempts=1)
     if posterior.size > _SEARCHED or (first is not None and first[1].grade.level == "reliable"):
         return first
-    limited = replace(plan, seconds=SEARCH if plan.seconds is None else plan.seconds)
-    run = by_search(posterior, limited, optima, jobs=jobs, rough=problem.rough)
+    run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough)
     return around() if run is None else (run, draws_of(posterior, run))
 
 

@@ -82,8 +82,7 @@ def linear_dynamics(
     if not supported or not all(linear(effect) for effect in effects):
         return None
     acting = _acting(state, [effect.name for effect in effects])
-    left = {one.search.axis for one in found if _at_noise(one, quiet[one.search.axis])}
-    if left < {one.search.axis for one in found} or not acting <= {one.search.axis for one in supported}:
+    if not at_noise(found, quiet) or not acting <= {one.search.axis for one in supported}:
         return None
     names = state.model.plant.table.layout.responses
     followed = dict.fromkeys(
@@ -93,8 +92,16 @@ def linear_dynamics(
     return Dynamics(f"{supported[0].said} follow {listed(list(followed))} as well")
 
 
+def at_noise(found: Sequence[Alternative], quiet: Sequence[int]) -> bool:
+    """Whether sums of lags, or the plant where that is better, leave no more than the noise, which is known
+    from so many `quiet` samples of each axis; without any sums of lags nothing is known of that."""
+    if not found:
+        return False
+    axes = {one.search.axis for one in found}
+    return axes == {one.search.axis for one in found if _at_noise(one, quiet[one.search.axis])}
+
+
 def _at_noise(one: Alternative, quiet: int) -> bool:
-    """Whether sums of lags, or the plant, leave no more than noise known from so many samples."""
     best = one.search.best
     chance = f_distribution.ppf(_CHANCE, best.size, quiet) if quiet else np.inf
     return bool(min(one.square, best.misfit) / best.size <= max(REACHED**2, chance))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, cast, final
 
@@ -14,8 +14,9 @@ from lcopa_bayes.data.agreement import Disagreement
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
+from lcopa_bayes.effectsearch.extrapolation import Extrapolated
 from lcopa_bayes.effectsearch.findings import Side, unfollowed
-from lcopa_bayes.effectsearch.lags import ess_with_lags, figures_with_lags, number_with_lags
+from lcopa_bayes.effectsearch.lags import at_noise, ess_with_lags, figures_with_lags, number_with_lags
 from lcopa_bayes.effectsearch.openeffects import Alternative, Weighed, mixture, step_figures
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying
@@ -93,21 +94,37 @@ class Loop:
             return Grade("unusable", said)
         if self.verdict.confidence == "tentative":
             said = "the verdict that they rest on is tentative"
-        elif self.verdict.leaves and all(one.support == "plant" for one in self.lags):
+        elif self._lacking:
             said = "the records hold something that the model they are of does not explain"
         return Grade("tentative", f"the draws are reliable, but {said}") if said else Grade("reliable", "")
+
+    @cached_property
+    def _lacking(self) -> bool:
+        """Whether something remains that neither the model nor the sums of lags beside it follow."""
+        return self.verdict.leaves and not at_noise(self.lags, self.base.noise_samples)
+
+    @cached_property
+    def extrapolated(self) -> Extrapolated:
+        """Paths whose steady value rests on a model that lacks something, not on the records."""
+        layout = self.problem.posterior.table.layout
+        return Extrapolated.of(self.figures if self._lacking else (), layout)
 
     def estimate(self, k: int) -> dict[str, Any]:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
         its standard deviations by noise and by structure, and lower end, median and upper end under the final
         model `alone`."""
-        here = self.number(k)
+        here, limits = self.number(k), [self._limit]
+        state = self.after.state
+        row = state.model.posterior.table.rows[state.model.columns[k]]
+        if row.kind == "gain" and (said := self.extrapolated.gain(*row.place)):
+            here, limits = replace(here, note=said), [Grade("unusable", said)]
         if self.draws is None:
-            return here.as_json(ess=np.nan, grade=self.grade.level, interval="Laplace")
+            grade = Grade.worst((self.grade, *limits)).level
+            return here.as_json(ess=np.nan, grade=grade, interval="Laplace")
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
         ess = ess_with_lags(own.ess, self.lags)
-        grade = Grade.worst((Grade(cast("Level", own.grade), ""), self._limit)).level
+        grade = Grade.worst((Grade(cast("Level", own.grade), ""), *limits)).level
         return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:

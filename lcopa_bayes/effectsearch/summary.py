@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -151,9 +152,14 @@ def _figures(result: Loop) -> list[dict[str, Any]]:
     ess, interval = np.nan, "Laplace"
     if draws is not None:
         ess, interval = ess_with_lags(draws.ess, result.lags), EQUAL_TAILED
-    grade = result.grade.level
-    kept = (one for one in result.figures if not one.name.startswith(("delay[", "steady_state[")))
-    return [one.as_json(ess=ess, grade=grade, interval=interval) for one in kept]
+    out = []
+    for one in result.figures:
+        if one.name.startswith(("delay[", "steady_state[")):
+            continue
+        said, grade = result.extrapolated.figure(one.name), result.grade.level
+        shown = replace(one, note=f"{one.note}. {said}" if one.note else said) if said else one
+        out.append(shown.as_json(ess=ess, grade="unusable" if said else grade, interval=interval))
+    return out
 
 
 def _open(result: Loop) -> list[dict[str, Any]]:

@@ -203,15 +203,18 @@ def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close
         assert draws.column(name).mean() == pytest.approx(own.column(name).mean(), abs=4 * sd * error)
 
 
-@pytest.mark.parametrize(("stated", "seconds"), [(None, explained.SEARCH), (300.0, 300.0)])
-def test_a_search_for_draws_has_little_time_unless_the_study_states_more(monkeypatch, stated, seconds):
+@pytest.mark.parametrize(("stated", "seconds"), [(None, explained.LIMIT), (300.0, 300.0)])
+@pytest.mark.parametrize(("effects", "ways"), [((), 3), (("trigger_jitter",), 1)])
+def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated, seconds, effects, ways):
+    """Around the optimum, by a search, and around it again; those with effects around it alone."""
     plans: list[SamplePlan] = []
-    monkeypatch.setattr(explained, "weighted_run", lambda *given, **how: None)
-    monkeypatch.setattr(explained, "by_search", lambda posterior, plan, *_, **how: plans.append(plan))
+    for way in ("weighted_run", "by_search"):
+        monkeypatch.setattr(explained, way, lambda posterior, plan, *_, **how: plans.append(plan))
     own = study(1)
     own = replace(own, sampler=replace(own.sampler, seconds=stated))
+    own = replace(own, effects=replace(own.effects, use=effects))
     assert explained_draws(own, lambda draws, noise: True, quick=True) is None
-    assert [plan.seconds for plan in plans] == [seconds]
+    assert [plan.seconds for plan in plans] == [seconds] * ways
 
 
 def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):

@@ -22,6 +22,7 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.leavingout import log_scores
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
+from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import risen
@@ -164,21 +165,52 @@ def test_a_loop_is_no_more_reliable_than_its_verdict(bent, confidence, level):
 
 
 @pytest.mark.parametrize(
-    ("kind", "support", "level"),
+    ("kind", "left", "level"),
     [
-        ("explained", "plant", "reliable"),
-        ("clean", "plant", "reliable"),
-        ("partly explained", "plant", "tentative"),
-        ("unexplained", "plant", "tentative"),
-        ("unexplained", "lags", "reliable"),
+        ("explained", None, "reliable"),
+        ("clean", None, "reliable"),
+        ("partly explained", None, "tentative"),
+        ("unexplained", None, "tentative"),
+        ("unexplained", 0.9, "reliable"),
+        ("unexplained", 1.8, "tentative"),
     ],
 )
-def test_numbers_of_a_model_that_leaves_something_are_tentative(bent, kind, support, level):
-    """Unless sums of lags, which the numbers are over too, follow what it leaves."""
+def test_numbers_of_a_model_that_leaves_something_are_tentative(bent, kind, left, level):
+    """Unless sums of lags, which the numbers are over too, follow what it leaves down to the noise."""
     draws = SimpleNamespace(grade=Grade("reliable", "draws agree"))
     verdict = replace(bent.verdict, kind=kind, confidence="firm")
-    one = replace(bent, verdict=verdict, draws=draws, lags=(SimpleNamespace(support=support),))
+    one = replace(bent, verdict=verdict, draws=draws, lags=lags_leaving(left))
     assert one.grade.level == level
+
+
+def lags_leaving(ratio):
+    """Sums of lags that leave so many times the noise, none without a ratio, where the plant leaves twice."""
+    best = SimpleNamespace(size=400, misfit=400 * 2.0**2)
+    search, square = SimpleNamespace(axis=0, best=best), 400 * (ratio or 0.0) ** 2
+    found = SimpleNamespace(search=search, square=square, support="plant", paths=())
+    return (found,) if ratio else ()
+
+
+@pytest.mark.parametrize(("end", "extrapolates"), [(0.95, False), (0.85, True), (0.2, True)])
+def test_steady_values_beyond_the_records_are_unusable_where_something_remains(bent, end, extrapolates):
+    """Three lags behind a clock of uncertain start had five times their gain, from 3 to 6 where 0.8 is true,
+    graded reliable."""
+    shown = (("steady_state[x]", 2.0), ("value_at_end[x]", 2.0 * end), ("rise_10_90[x]", 9.0))
+    figures = tuple(Weighed(name, "-", [np.full(8, value)], np.ones(1)) for name, value in shown)
+    for kind, left in (("unexplained", None), ("explained", None), ("unexplained", 0.9)):
+        verdict = replace(bent.verdict, kind=kind, confidence="firm")
+        one = replace(bent, verdict=verdict, lags=lags_leaving(left))
+        one.__dict__["figures"] = figures
+        beyond = extrapolates and kind == "unexplained" and left is None
+        assert bool(one.extrapolated.shares) == beyond
+        if left is not None:
+            continue
+        reported = results(one)
+        graded = {row["name"]: row for row in reported["parameters"] + reported["figures"]}
+        for name in ("gain", "rise_10_90[x]"):
+            assert (graded[name]["grade"] == "unusable") == beyond
+            assert (f"{100 * (1 - end):.0f} % of the steady value" in graded[name].get("note", "")) == beyond
+        assert "unusable" not in {graded[name]["grade"] for name in ("delay", "value_at_end[x]")}
 
 
 def test_parameters_without_draws_are_values_and_not_coordinates(clean):
