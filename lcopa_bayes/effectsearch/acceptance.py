@@ -18,8 +18,8 @@ CLEAR = 1.5
 [-]."""
 
 
-def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
-    """Refits that may be kept, by falling evidence.
+def accepted(refits: Sequence[Refit], seen: Trace, bar: float, *, generic: bool = True) -> list[Refit]:
+    """Refits that may be kept, by falling evidence; behind a generic class too where that is no rival.
 
     What linear dynamics without a name explain as well is no evidence of a name: a zero, a further lag, or
     paths that differ in what the model lets them share look like many effects.
@@ -28,7 +28,7 @@ def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
     ahead = (one for one in refits if one.dynamics or one.log_bayes_factor > linear + MARGIN)
     # beside such dynamics a linear effect is one more of them
     ahead = (one for one in ahead if one.dynamics or not (one.linear and one.unnamed))
-    return [one for one in ahead if acceptable(one, seen, bar)]
+    return [one for one in ahead if acceptable(one, seen, bar, generic=generic)]
 
 
 def beside_dynamics(likely: Sequence[Refit], dynamics: Sequence[Refit]) -> list[Refit]:
@@ -61,13 +61,13 @@ def _remains(linear: Refit, candidate: Refit) -> bool:
     return both.log_bayes_factor > MARGIN and both.significant
 
 
-def acceptable(candidate: Refit, seen: Trace, bar: float) -> bool:
-    """Whether a refit has more evidence than a `bar` [nat] and any generic class, predicts records left out
+def acceptable(candidate: Refit, seen: Trace, bar: float, *, generic: bool = True) -> bool:
+    """Whether a refit has more evidence than a `bar` [nat] and any `generic` class, predicts records left out
     better, and is a significant effect at a possible optimum."""
-    generics = (g for g in seen.traced if g.card.place == "generic")
+    generics = (g for g in seen.traced if generic and g.card.place == "generic")
     others = (g for g in generics if not (candidate.dynamics and g.card.dynamics))
-    generic = max((g.log_bayes_factor for g in others), default=-np.inf)
-    ahead = candidate.log_bayes_factor > generic + MARGIN
+    rival = max((g.log_bayes_factor for g in others), default=-np.inf)
+    ahead = candidate.log_bayes_factor > rival + MARGIN
     return (
         candidate.log_bayes_factor > bar
         and ahead

@@ -166,6 +166,8 @@ def search(
         return Round(state, seen)
 
     rounds, groups = _one_by_one(first or looking(start), looking, crew, alone=alone)
+    if rounds[-1].alarmed and not alone:
+        rounds, groups = _past_generic(rounds, groups, looking, crew)
     while rounds[-1].alarmed and len(rounds) > 1 and rounds[-2].state.model.effects:
         if better(rounds[-1].state, rounds[-2].state):
             break
@@ -177,10 +179,17 @@ def search(
 
 
 def _one_by_one(
-    first: Round, looking: Callable[[State], Round], crew: Crew, *, alone: bool
+    first: Round,
+    looking: Callable[[State], Round],
+    crew: Crew,
+    *,
+    alone: bool,
+    before: Sequence[Round] = (),
+    generic: bool = True,
 ) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
-    """Rounds that each add an effect but the last, and the names that each of these is confounded with."""
-    look, rounds, groups = first, list[Round](), dict[str, tuple[str, ...]]()
+    """Rounds `before` and those that each add an effect but the last, and the names that each effect added
+    here is confounded with; only effects ahead of any `generic` class, unless that is no rival."""
+    look, rounds, groups = first, list(before), dict[str, tuple[str, ...]]()
     while True:
         seen, state, number = look.trace, look.state, len(rounds)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
@@ -190,9 +199,10 @@ def _one_by_one(
         look = look.refitted(crew)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
-        likely = [one for one in accepted(look.refits, seen, bar) if not alone or large(one)]
+        allowed = accepted(look.refits, seen, bar, generic=generic)
+        likely = [one for one in allowed if not alone or large(one)]
         chosen = leader(beside_dynamics(likely, [one for one in look.refits if one.dynamics]))
-        if chosen is not None and chosen.dynamics and groups:
+        if chosen is not None and chosen.dynamics and (groups or before):
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
         rounds.append(replace(look, chosen=chosen))
         if chosen is None:
@@ -200,6 +210,25 @@ def _one_by_one(
         if not chosen.dynamics:
             groups[chosen.added[0]] = group(state, chosen, look.refits, seen)
         look = looking(in_proportion(_kept(chosen)))
+
+
+def _past_generic(
+    rounds: list[Round], groups: dict[str, tuple[str, ...]], looking: Callable[[State], Round], crew: Crew
+) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
+    """Rounds that go on where a generic class was ahead of every effect, if the effects they add have more
+    evidence than that class together; else the same `rounds`.
+
+    What several effects leave a generic class describes better than each of them alone.
+    """
+    last = rounds[-1]
+    generic = max(
+        (one.log_bayes_factor for one in last.trace.traced if one.card.place == "generic"), default=0.0
+    )
+    further, more = _one_by_one(last, looking, crew, alone=False, before=rounds[:-1], generic=False)
+    if len(further) == len(rounds):
+        return rounds, groups
+    gained, _ = _gained(last.state, further[-1].state, last.trace.scale.quiet)
+    return (further, groups | more) if gained > generic + MARGIN else (rounds, groups)
 
 
 def _pair(
