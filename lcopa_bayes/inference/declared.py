@@ -29,7 +29,14 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.declared import Declared
-from lcopa_bayes.model.effects.effect import Coefficient, Constant, Effect, Ranges, ScatterEffect
+from lcopa_bayes.model.effects.effect import (
+    Coefficient,
+    Constant,
+    Effect,
+    Ranges,
+    ScatterEffect,
+    devices_of,
+)
 from lcopa_bayes.model.effects.scales import own_drives
 from lcopa_bayes.model.layout import Layout
 
@@ -137,6 +144,7 @@ def record_ranges(study: Study, layout: Layout, scales: Scales) -> Ranges:
         speed=float(speed),
         direct=direct,
         names=tuple(axis.name for axis in layout.responses),
+        devices=devices_of([axis.unit for axis in layout.responses]),
     )
 
 

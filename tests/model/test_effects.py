@@ -51,16 +51,16 @@ NAMES = [
 ALL = bundled()
 
 
-def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
-    """Base model of two records, its values, and its responses by `prediction`."""
+def two_axes(unit: str = "rad") -> tuple[Effected, np.ndarray, list[np.ndarray]]:
+    """Base model of two records, its values, and its responses by `prediction`; the second one in `unit`."""
 
     def path(gain: float, terms: tuple[tuple[float, float], ...]) -> TransferPath:
         return TransferPath(gain, 0.3873, tuple(t**a for t, a in terms), tuple(a for _, a in terms), 1.0)
 
     direct, cross = ((1.2, 1.7), (1.6, 0.7)), ((2.0, 0.9),)
-    axes = (Axis("x", "rad"), Axis("y", "rad"))
+    axes, read = (Axis("x", "rad"), Axis("y", "rad")), (Axis("x", "rad"), Axis("y", unit))
     paths = ((path(1.0, direct), path(0.2, cross)), (path(0.3, cross), path(1.5, direct)))
-    device = Device(paths, axes, axes, (0.1, 0.1))
+    device = Device(paths, axes, read, (0.1, 0.1))
     commands = (
         joint(on_off(1.0, hold=9.3, at=0.37), staircase([0.5, -0.4, 0.2], hold=6.1, start=1.03)),
         joint(on_off(-0.6, hold=7.2, at=1.38, rest=0.2), on_off(0.8, hold=5.0, at=2.64)),
@@ -79,7 +79,7 @@ def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
         "offset": lambda p: 0.1,
     }
     values = np.array([reported.get(row.kind, lambda p: 0.01)(row.place) for row in table.rows])
-    plain = [read[:, 0].T + 0.1 for read in responses(table, posterior.model, values[None])]
+    plain = [one[:, 0].T + 0.1 for one in responses(table, posterior.model, values[None])]
     return effected(posterior, values), values, plain
 
 
@@ -336,6 +336,37 @@ def test_sensor_lag_is_one_more_lag():
         reported = made.responses(values, np.array([lag]))[0][:, 0]
         assert np.abs(reported - exact).max() < 0.012  # the kink at the onset falls within a block
         assert np.abs(reported - exact)[t > 1.0].max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [
+        ("odd_curvature", 0.1),
+        ("even_curvature", 0.1),
+        ("clipping", 1.0),
+        ("gain_drift", 0.1),
+        ("sensor_lag", 0.3),
+    ],
+)
+def test_responses_of_two_units_are_read_by_two_devices(name: str, size: float):
+    model, values, plain = two_axes("degC")
+    grid = ALL[name].grid(model.ranges)
+    made = model.with_effects([grid[0]])
+    alike = BASE.with_effects([grid[0]])
+    own = [one.coefficient.name for one in made.coefficients]
+    assert own == [f"{one.coefficient.name}_{axis}" for one in alike.coefficients for axis in ("x", "y")]
+    first, second, both = (made.responses(values, size * np.array(psi)) for psi in ((1, 0), (0, 1), (1, 1)))
+    assert all(
+        max(np.abs(one[:, axis] - still[:, axis]).max() for one, still in zip(moved, plain, strict=True))
+        > 1e-3
+        for axis, moved in enumerate((first, second))
+    )
+    for k, still in enumerate(plain):
+        for axis, (moved, rests) in enumerate(((first, second), (second, first))):
+            assert np.array_equal(moved[k][:, axis], both[k][:, axis])
+            assert_allclose(rests[k][:, axis], still[:, axis], atol=1e-12)
+    if name in ("gain_drift", "sensor_lag"):  # the others are measured in deflections
+        assert_allclose(alike.responses(VALUES, np.array([size]))[0], both[0], atol=1e-12)
 
 
 @given(rate=st.floats(1e-3, 60.0))

@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeAlias, final
+
+import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
@@ -56,6 +58,8 @@ class Ranges:
     """Drive that each response axis belongs to [-]."""
     names: tuple[str, ...]
     """Names of the response axes."""
+    devices: Index
+    """Device that reads each response axis, one for every unit [-]."""
 
     @property
     def axes(self) -> int:
@@ -341,6 +345,21 @@ def single(
 ) -> tuple[Coefficient, ...]:
     """One coefficient; a share has one sign."""
     return (Coefficient(name, unit, scale, one_signed or share, share=share),)
+
+
+def per_device(ranges: Ranges, one: Coefficient) -> tuple[Coefficient, ...]:
+    """A coefficient for every device that reads responses, named after its first axis where there are
+    several: axes of one unit share it."""
+    _, first = np.unique(ranges.devices, return_index=True)
+    if first.size == 1:
+        return (one,)
+    return tuple(replace(one, name=f"{one.name}_{ranges.names[axis]}") for axis in first)
+
+
+def devices_of(units: Sequence[str]) -> Index:
+    """Number of each one's unit, in the order of their first."""
+    order = list(dict.fromkeys(units))
+    return np.array([order.index(unit) for unit in units], dtype=np.intp)
 
 
 def per_axis(ranges: Ranges, names: Sequence[str], part: float) -> tuple[Coefficient, ...]:

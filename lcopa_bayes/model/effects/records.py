@@ -21,6 +21,7 @@ from lcopa_bayes.model.effects.effect import (
     ScatterEffect,
     Scene,
     per_axis,
+    per_device,
     single,
 )
 
@@ -31,7 +32,6 @@ class GainDrift(ReadoutEffect):
 
     linear = True
     affine = True
-    estimated = single("d", 0.03)
     card: ClassVar[Card] = Card(
         name="gain_drift",
         place="noise",
@@ -41,9 +41,13 @@ class GainDrift(ReadoutEffect):
         mistaken_for="pointing_offset",
     )
 
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """d of every device."""
+        return per_device(ranges, Coefficient("d", "-", 0.03))
+
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
-        return np.asarray((1 + psi[0] * scene.epoch) * y)
+        return np.asarray((1 + psi[scene.ranges.devices] * scene.epoch) * y)
 
 
 @final

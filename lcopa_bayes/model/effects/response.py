@@ -9,7 +9,15 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.model.effects.effect import Card, Ranges, ReadoutEffect, Scene, single
+from lcopa_bayes.model.effects.effect import (
+    Card,
+    Coefficient,
+    Ranges,
+    ReadoutEffect,
+    Scene,
+    per_device,
+    single,
+)
 from lcopa_bayes.model.layout import Layout
 
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
@@ -23,7 +31,6 @@ class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
     linear = True
-    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="odd_curvature",
         place="output",
@@ -33,9 +40,13 @@ class OddCurvature(ReadoutEffect):
         mistaken_for="gain; voltage_knee",
     )
 
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c of every device."""
+        return per_device(ranges, Coefficient("c", "-", 0.03))
+
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
-        return np.asarray(y + psi[0] * y * (y / scene.ranges.response) ** 2)
+        return np.asarray(y + psi[scene.ranges.devices] * y * (y / scene.ranges.response) ** 2)
 
 
 @final
@@ -43,7 +54,6 @@ class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
     linear = True
-    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="even_curvature",
         place="output",
@@ -53,9 +63,13 @@ class EvenCurvature(ReadoutEffect):
         mistaken_for="gain",
     )
 
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c of every device."""
+        return per_device(ranges, Coefficient("c", "-", 0.03))
+
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
-        return np.asarray(y + psi[0] * y**2 / scene.ranges.response)
+        return np.asarray(y + psi[scene.ranges.devices] * y**2 / scene.ranges.response)
 
 
 @final
@@ -125,7 +139,6 @@ class Clipping(ReadoutEffect):
 
     ratios = RATIO
     linear = True
-    estimated = single("c", 0.6, share=True)
     card: ClassVar[Card] = Card(
         name="clipping",
         place="output",
@@ -140,11 +153,15 @@ class Clipping(ReadoutEffect):
         """From half the range to its end."""
         return tuple(cls(level) for level in (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.985))
 
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c of every device."""
+        return per_device(ranges, Coefficient("c", "-", 0.6, one_signed=True, share=True))
+
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         limit = self.level * self.skew ** np.arange(scene.ranges.axes) * scene.ranges.response
         beyond = np.maximum(np.abs(y) - limit, 0.0)
-        return np.asarray(y - psi[0] * np.sign(y) * beyond)
+        return np.asarray(y - psi[scene.ranges.devices] * np.sign(y) * beyond)
 
 
 @final

@@ -8,7 +8,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.model.blockpulses import Circle
-from lcopa_bayes.model.effects.effect import Ranges
+from lcopa_bayes.model.effects.effect import Ranges, devices_of
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.forward import Experiment, ForwardModel, deflections
 from lcopa_bayes.model.layout import Layout
@@ -54,6 +54,7 @@ def ranges_of(model: ForwardModel, plant: Plant, times: Sequence[Vector]) -> Ran
         _speed(plant, model.layout.element_of[0][int(direct[0])], span),
         direct,
         tuple(axis.name for axis in model.layout.responses),
+        devices_of([axis.unit for axis in model.layout.responses]),
     )
 
 

@@ -8,7 +8,15 @@ import numpy as np
 from scipy.signal import lfilter
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.model.effects.effect import Card, Coefficient, Ranges, Scene, SensorEffect, single
+from lcopa_bayes.model.effects.effect import (
+    Card,
+    Coefficient,
+    Ranges,
+    Scene,
+    SensorEffect,
+    per_device,
+    single,
+)
 
 _CUBIC = np.linalg.inv(np.vander(np.array([-1.0, 0.0, 1.0, 2.0]), increasing=True))
 """Coefficients of the Lagrange polynomials on the blocks -1, 0, 1, 2, one per column."""
@@ -31,16 +39,24 @@ class SensorLag(SensorEffect):
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """Ts [time unit]."""
-        return single("Ts", 2 * ranges.period, "time", one_signed=True)
+        """Ts of every device [time unit]."""
+        return per_device(ranges, Coefficient("Ts", "time", 2 * ranges.period, one_signed=True))
 
     def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Exact for cubics through four blocks. Ts below 0 has no meaning: NaN."""
-        if psi[0] == 0.0:
+        out = np.empty(y.shape)
+        for device, lag in enumerate(psi):
+            own = scene.ranges.devices == device
+            out[own] = self._lagging(y[own], scene.grid.step, float(lag))
+        return out
+
+    def _lagging(self, y: Matrix, step: float, lag: float) -> Matrix:
+        """Readings (axes, blocks) of one device."""
+        if lag == 0.0:
             return y
-        if psi[0] < 0.0:
+        if lag < 0.0:
             return np.full(y.shape, np.nan)
-        rate = scene.grid.step / float(psi[0])
+        rate = step / lag
         weights = _moments(rate) @ _CUBIC
         padded = np.pad(y, ((0, 0), (2, 1)))
         padded[:, -1] = 2 * y[:, -1] - y[:, -2] if y.shape[1] > 1 else y[:, -1]
