@@ -100,8 +100,9 @@ class Loop:
 
     @cached_property
     def _lacking(self) -> bool:
-        """Whether something remains that neither the model nor the sums of lags beside it follow."""
-        return self.verdict.leaves and not at_noise(self.lags, self.base.noise_samples)
+        """Whether something remains that sums of lags, which the numbers are over too, do not follow."""
+        supported = any(one.support != "plant" for one in self.lags)
+        return self.verdict.leaves and not (supported and at_noise(self.lags, self.base.noise_samples))
 
     @cached_property
     def extrapolated(self) -> Extrapolated:

@@ -181,13 +181,15 @@ def test_numbers_of_a_model_that_leaves_something_are_tentative(bent, kind, left
     verdict = replace(bent.verdict, kind=kind, confidence="firm")
     one = replace(bent, verdict=verdict, draws=draws, lags=lags_leaving(left))
     assert one.grade.level == level
+    apart = replace(one, lags=lags_leaving(left, support="plant"))  # the numbers are not over them
+    assert apart.grade.level == ("tentative" if verdict.leaves else "reliable")
 
 
-def lags_leaving(ratio):
+def lags_leaving(ratio, support="lags"):
     """Sums of lags that leave so many times the noise, none without a ratio, where the plant leaves twice."""
     best = SimpleNamespace(size=400, misfit=400 * 2.0**2)
     search, square = SimpleNamespace(axis=0, best=best), 400 * (ratio or 0.0) ** 2
-    found = SimpleNamespace(search=search, square=square, support="plant", paths=())
+    found = SimpleNamespace(search=search, square=square, support=support, paths=())
     return (found,) if ratio else ()
 
 
