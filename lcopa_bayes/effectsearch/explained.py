@@ -34,10 +34,11 @@ from lcopa_bayes.sampling.weightedrun import weighted_run
 _DRAWS, _STREAM = 100, 13
 """Normal draws about an optimum [-], and the mark of their randomness."""
 LIMIT = 150.0
-"""Time for draws by a search, and for those around optima, where the study states none [s]. A search of three
-response axes took 77 s with two processes and gave reliable draws; ended after 40 s it gave none, and what is
-tried then took longer. Around the optimum of a plant far from its records proposals were fitted for ten
-minutes without it."""
+"""Time for draws by a search, where the study states none [s]. That of three response axes took 77 s with two
+processes and gave reliable ones; ended after 40 s it gave none, and what is tried then took longer."""
+AROUND = 75.0
+"""The same for those around the optimum of a plant with effects [s]: what is drawn by then is used, and
+proposals for jitter of every record were fitted for ten minutes without coming close."""
 _SEARCHED = 6_000
 """Most samples of a plant that is searched [-]: of 10 700 of two axes a search took seven minutes of one
 processor, and ended without draws of the second axis."""
@@ -151,7 +152,8 @@ def _sampled(
     often. It takes minutes, and is left to a fit, of many samples and under noise that is not Gaussian, where
     gains and offsets are searched too."""
     posterior, plan = problem.posterior, plan_of(problem, quick=False)
-    plan = replace(plan, seconds=LIMIT if plan.seconds is None else plan.seconds)
+    limit = LIMIT if posterior.simulation is None else AROUND
+    plan = replace(plan, seconds=limit if plan.seconds is None else plan.seconds)
     around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima)
     plain = posterior.simulation is None and isinstance(posterior.noise, GaussianNoise)
     if not (plain and optima):

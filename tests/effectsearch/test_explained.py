@@ -203,9 +203,11 @@ def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close
         assert draws.column(name).mean() == pytest.approx(own.column(name).mean(), abs=4 * sd * error)
 
 
-@pytest.mark.parametrize(("stated", "seconds"), [(None, explained.LIMIT), (300.0, 300.0)])
-@pytest.mark.parametrize(("effects", "ways"), [((), 3), (("trigger_jitter",), 1)])
-def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated, seconds, effects, ways):
+@pytest.mark.parametrize("stated", [None, 300.0])
+@pytest.mark.parametrize(
+    ("effects", "limit", "ways"), [((), explained.LIMIT, 3), (("trigger_jitter",), explained.AROUND, 1)]
+)
+def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated, effects, limit, ways):
     """Around the optimum, by a search, and around it again; those with effects around it alone."""
     plans: list[SamplePlan] = []
     for way in ("weighted_run", "by_search"):
@@ -214,7 +216,7 @@ def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated
     own = replace(own, sampler=replace(own.sampler, seconds=stated))
     own = replace(own, effects=replace(own.effects, use=effects))
     assert explained_draws(own, lambda draws, noise: True, quick=True) is None
-    assert [plan.seconds for plan in plans] == [seconds] * ways
+    assert [plan.seconds for plan in plans] == [stated or limit] * ways
 
 
 def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):
