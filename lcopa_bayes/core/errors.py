@@ -70,7 +70,7 @@ def gathered(problems: list[str], where: str = "") -> Iterator[None]:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """`; did you mean 'x'?` for the known word closest to `word`, or the list of all known words."""
-    words = sorted(known)
+    words = sorted(set(known))
     close = difflib.get_close_matches(word, words, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
