@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.findings import Side
 from lcopa_bayes.effectsearch.lags import ess_with_lags
 from lcopa_bayes.effectsearch.leavingout import in_turn
@@ -26,7 +27,7 @@ FAR = 2.0
 SHOWN = 0.1
 """Weight beside that of the final model from which an effect that is open is listed [-]."""
 _NEAREST = 4
-"""Rivals that are listed for each named effect [-]."""
+"""Rivals that are listed for each named effect, and that a further record is to separate it from [-]."""
 
 
 def results(result: Loop) -> dict[str, Any]:
@@ -311,8 +312,8 @@ def next_measurement(result: Loop) -> str:
     cards = {one.name: one.card for one in trace.traced}
     for group in result.groups:
         if len(group) > 1:
-            wanted = _wanted([cards[name] for name in group if name in cards])
-            return f"To separate {', '.join(group)}, record {wanted}."
+            wanted = _wanted([cards[name] for name in group[: _NEAREST + 1] if name in cards])
+            return f"To separate {group[0]} from {listed(group[1:], _NEAREST)}, record {wanted}."
     if result.verdict.kind == "unexplained":
         if result.lags:
             return "Record until the responses settle, and sample their onset: sums of lags leave both open."

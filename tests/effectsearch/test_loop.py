@@ -26,7 +26,7 @@ from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import risen
-from lcopa_bayes.effectsearch.summary import drawn, results, words
+from lcopa_bayes.effectsearch.summary import drawn, next_measurement, results, words
 from lcopa_bayes.effectsearch.verdict import COVERED, Dynamics, Findings, Miss, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
@@ -224,6 +224,15 @@ def test_parameters_without_draws_are_values_and_not_coordinates(clean):
         assert row["lower"] < row["value"] < row["upper"]
         assert row["lower"] - 2 * row["sd"] < truth < row["upper"] + 2 * row["sd"]
         assert row["upper"] - row["lower"] < 0.5 * truth
+
+
+def test_a_further_record_separates_an_effect_from_the_nearest_of_many(bent):
+    """It was to separate seventeen names by as many excitations."""
+    names = tuple(catalogue())[:9]
+    said = next_measurement(replace(bent, groups=(("odd_curvature", *names),)))
+    assert said.startswith(f"To separate odd_curvature from {', '.join(names[:4])} and 5 more, record ")
+    few = next_measurement(replace(bent, groups=(("odd_curvature", "even_curvature"),)))
+    assert few.startswith("To separate odd_curvature from even_curvature, record ")
 
 
 def test_parameters_biased_by_the_effect_are_listed(bent):

@@ -35,7 +35,10 @@ def test_the_version_is_that_of_the_package(capsys):
     [
         (("fti", "x"), "'fti' is not a verb; did you mean 'fit'?"),
         (("fit", "x", "--quik"), "--quik is not an option of fit; did you mean '--quick'?"),
-        (("fit", "x", "--folder"), "of fit; known: --cross-check, --dask, --held-out, --help, --jobs, --json"),
+        (
+            ("fit", "x", "--folder"),
+            "of fit; known: --cross-check, --dask, --held-out, --help, --jobs, --json",
+        ),
         (("audit",), "the following arguments are required: source"),
         (("predict", "a", "b", "--offset", "some"), "invalid choice: 'some'"),
     ],
