@@ -218,7 +218,7 @@ def _past_generic(
     """Rounds that go on where a generic class was ahead of every effect, if the effects they add have more
     evidence than that class together; else the same `rounds`.
 
-    What several effects leave a generic class describes better than each of them alone.
+    A generic class describes what several effects leave better than any one of them does.
     """
     last = rounds[-1]
     generic = max(

@@ -1,4 +1,4 @@
-"""Effects behind a generic class: what several of them leave it describes better than each alone."""
+"""Effects behind a generic class, which describes what several of them leave better than any one does."""
 
 from dataclasses import replace
 
