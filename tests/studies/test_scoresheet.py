@@ -28,7 +28,9 @@ from lcopa_bayes.model.path import TransferPath
 
 SIZE = np.array([0.02, 0.03])
 RATIO = np.array([1.1, 1.1])
-RANGES = SimpleNamespace(response=RATIO * SIZE, column=(RATIO * SIZE)[:, None], axes=2)
+RANGES = SimpleNamespace(
+    response=RATIO * SIZE, column=(RATIO * SIZE)[:, None], axes=2, devices=np.zeros(2, int)
+)
 SCENE = SimpleNamespace(ranges=RANGES)
 LEVELS = np.random.default_rng(3).uniform(-1.2, 1.2, (2, 40)) * SIZE[:, None]
 
@@ -92,7 +94,15 @@ def test_every_named_effect_has_sizes_or_a_reason() -> None:
     for name, sizes in devicetruth.SIZES.items():
         kind, numbers = catalogue((), None)[name], NAMED[name](np.random.default_rng(0)).numbers
         fields = set(getattr(kind, "__dataclass_fields__", {}))
-        names = {one.name for one in getattr(kind, "estimated", ())} | {"k_x_2", "k_y_1", "Ts", "Te", "e"}
+        names = {one.name for one in getattr(kind, "estimated", ())} | {
+            "k_x_2",
+            "k_y_1",
+            "Ts",
+            "Te",
+            "c",
+            "d",
+            "e",
+        }
         assert set(sizes(numbers, RATIO)) <= fields | names, name
 
 
