@@ -25,7 +25,7 @@ _SHARE = 0.1
 @final
 @dataclass(frozen=True)
 class Extrapolated:
-    """Paths whose steady value is an extrapolation; none by default."""
+    """Paths whose steady value is an extrapolation."""
 
     shares: Mapping[str, float]
     """Of its steady value, what each path has not reached by the end of the longest record, by name [-]."""
@@ -44,16 +44,20 @@ class Extrapolated:
 
     def gain(self, response: int, drive: int) -> str:
         """Why the gain of a path says nothing of the plant, a sentence; empty where it does."""
-        name = next(one.name for one in self.layout.paths if (one.response, one.drive) == (response, drive))
-        return self._said([name])
+        return self._said([self._path(response, drive)])
 
     def figure(self, name: str) -> str:
         """The same of a figure of a step response: of what it is measured by its steady value."""
         kind, _, place = name.removesuffix("]").partition("[")
         if kind in _MEASURED:
             return ""
-        ratios = crosstalk_of(self.layout)
-        return self._said([path.name for path in ratios[name]] if name in ratios else [place])
+        if kind != "crosstalk":
+            return self._said([place])
+        i, own, j = crosstalk_of(self.layout)[name]
+        return self._said([self._path(i, j), self._path(own, j)])
+
+    def _path(self, response: int, drive: int) -> str:
+        return next(one.name for one in self.layout.paths if (one.response, one.drive) == (response, drive))
 
     def _said(self, paths: Sequence[str]) -> str:
         share = max((self.shares.get(path, 0.0) for path in paths), default=0.0)

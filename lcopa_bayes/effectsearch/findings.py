@@ -96,9 +96,7 @@ def findings_of(
 ) -> Findings:
     """What a search found, `before` without its effects and `after` with them."""
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
-    generics = (one for one in first.traced if one.card.place == "generic")
-    generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
-    added, names = searched.state.model.effects, named_effects(searched.state)
+    generic, added, names = first.generic, searched.state.model.effects, named_effects(searched.state)
     by_record = bool(added) and all(effect.card.per_record for effect in added)
     was, now, varying = before.unseen, after.unseen, tuple[str, ...]()
     # where something remains, what is free in every record takes up some of it in these too

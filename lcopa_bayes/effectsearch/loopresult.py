@@ -26,6 +26,7 @@ from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import Verdict
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.sampling.convergence import Grade, Level
@@ -114,30 +115,32 @@ class Loop:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
         its standard deviations by noise and by structure, and lower end, median and upper end under the final
         model `alone`."""
-        here, limits = self.number(k), [self._limit]
-        state = self.after.state
-        row = state.model.posterior.table.rows[state.model.columns[k]]
+        here, row, limit = self.number(k), self._row(k), self._limit
         if row.kind == "gain" and (said := self.extrapolated.gain(*row.place)):
-            here, limits = replace(here, note=said), [Grade("unusable", said)]
+            here, limit = replace(here, note=said), Grade("unusable", said)
         if self.draws is None:
-            grade = Grade.worst((self.grade, *limits)).level
+            grade = Grade.worst((self.grade, limit)).level
             return here.as_json(ess=np.nan, grade=grade, interval="Laplace")
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
         ess = ess_with_lags(own.ess, self.lags)
-        grade = Grade.worst((Grade(cast("Level", own.grade), ""), *limits)).level
+        grade = Grade.worst((Grade(cast("Level", own.grade), ""), limit)).level
         return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
+
+    def _row(self, k: int) -> Parameter:
+        """The parameter that is a coordinate of the final model."""
+        model = self.after.state.model
+        return model.posterior.table.rows[model.columns[k]]
 
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""
-        state = self.after.state
-        row = state.model.posterior.table.rows[state.model.columns[k]]
+        row = self._row(k)
         pairs = zip(*self._mixture, strict=True)
         own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
         shares = np.array([weight for _, weight in own])
         number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
         number = self.plants.number(number, row)
-        return number_with_lags(number, row, self.lags, state.model.plant.table.layout)
+        return number_with_lags(number, row, self.lags, self.after.state.model.plant.table.layout)
 
     @cached_property
     def figures(self) -> tuple[Weighed, ...]:

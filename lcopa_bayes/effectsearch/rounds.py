@@ -221,14 +221,12 @@ def _past_generic(
     A generic class describes what several effects leave better than any one of them does.
     """
     last = rounds[-1]
-    generic = max(
-        (one.log_bayes_factor for one in last.trace.traced if one.card.place == "generic"), default=0.0
-    )
     further, more = _one_by_one(last, looking, crew, alone=False, before=rounds[:-1], generic=False)
     if len(further) == len(rounds):
         return rounds, groups
     gained, _ = _gained(last.state, further[-1].state, last.trace.scale.quiet)
-    return (further, groups | more) if gained > generic + MARGIN else (rounds, groups)
+    ahead = last.trace.generic is None or gained > last.trace.generic.log_bayes_factor + MARGIN
+    return (further, groups | more) if ahead else (rounds, groups)
 
 
 def _pair(

@@ -112,6 +112,12 @@ class Trace:
         return self.largest > self.threshold
 
     @property
+    def generic(self) -> Traced | None:
+        """The generic class of most evidence; None without any."""
+        classes = (one for one in self.traced if one.card.place == "generic")
+        return max(classes, key=lambda one: one.log_bayes_factor, default=None)
+
+    @property
     def scatter(self) -> float:
         """Evidence that the noise is not normal [nat]; -inf where that was not asked."""
         return max((one.log_bayes_factor for one in self.traced if one.scatters), default=-np.inf)

@@ -117,8 +117,8 @@ def _place(value: float) -> int:
 
 
 def _power_of_ten(value: float, count: int) -> int:
-    """Of `value` rounded to `count` digits: read off its decimals, as no quotient and no logarithm ends for
-    the least and the largest numbers."""
+    """Of `value` rounded to `count` digits, read off its decimals: powers of ten and logarithms fail at the
+    smallest and the largest numbers."""
     return int(f"{value:.{count - 1}e}".partition("e")[2])
 
 

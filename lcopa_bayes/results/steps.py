@@ -17,7 +17,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
-from lcopa_bayes.model.layout import Layout, PathSlot, Unit
+from lcopa_bayes.model.layout import Layout, Unit
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 
@@ -307,23 +307,21 @@ def _difference(high: Vector, low: Vector) -> Vector:
 def _crosstalk(layout: Layout, curves: StepCurves) -> list[Metric]:
     """Steady response of the other axes over that of the driven one, where two axes respond."""
     out = []
-    for name, (other, own) in crosstalk_of(layout).items():
-        above, below = (curves.gains[:, one.response, one.drive] for one in (other, own))
-        ratio = np.where(below != 0, above / np.where(below != 0, below, 1), np.inf)
-        unit = per(layout.responses[other.response].unit, layout.responses[own.response].unit)
-        out.append(Metric(name, unit, ratio))
+    for name, (i, own, j) in crosstalk_of(layout).items():
+        direct, other = curves.gains[:, own, j], curves.gains[:, i, j]
+        ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
+        out.append(Metric(name, per(layout.responses[i].unit, layout.responses[own].unit), ratio))
     return out
 
 
-def crosstalk_of(layout: Layout) -> dict[str, tuple[PathSlot, PathSlot]]:
-    """Figures that compare the steady responses to one drive, by name: the path to the other axis, and that
-    to the one that the drive belongs to."""
+def crosstalk_of(layout: Layout) -> dict[str, tuple[int, int, int]]:
+    """Figures that compare the steady responses to one drive, by name: the other axis, the one that the drive
+    belongs to, and the drive."""
     out = {}
-    for other in layout.paths:
-        own = layout.own_response(other.drive)
-        if own is None or own == other.response:
-            continue
-        beside = next(one for one in layout.paths if (one.response, one.drive) == (own, other.drive))
-        names = layout.responses[other.response].name, layout.responses[own].name
-        out[f"crosstalk[{names[0]}/{names[1]} by {layout.drives[other.drive].name}]"] = other, beside
+    for j, drive in enumerate(layout.drives):
+        own = layout.own_response(j)
+        for i, response in enumerate(layout.responses):
+            if own is not None and i != own:
+                name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
+                out[name] = i, own, j
     return out

@@ -94,15 +94,7 @@ def test_every_named_effect_has_sizes_or_a_reason() -> None:
     for name, sizes in devicetruth.SIZES.items():
         kind, numbers = catalogue((), None)[name], NAMED[name](np.random.default_rng(0)).numbers
         fields = set(getattr(kind, "__dataclass_fields__", {}))
-        names = {one.name for one in getattr(kind, "estimated", ())} | {
-            "k_x_2",
-            "k_y_1",
-            "Ts",
-            "Te",
-            "c",
-            "d",
-            "e",
-        }
+        names = {one.name for one in getattr(kind, "estimated", ())} | {"k_x_2", "k_y_1", "Ts", "Te", "e"}
         assert set(sizes(numbers, RATIO)) <= fields | names, name
 
 

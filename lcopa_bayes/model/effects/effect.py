@@ -170,6 +170,8 @@ class Effect(ABC):
     card: ClassVar[Card]
     estimated: ClassVar[tuple[Coefficient, ...]] = ()
     """Coefficients whose scales are the same on any records."""
+    per_device: ClassVar[bool] = False
+    """Whether every device that reads responses has coefficients of its own; axes of one unit share one."""
     per_command: ClassVar[bool] = False
     """Whether it is computed command by command, which takes long on records of thousands."""
     linear: ClassVar[bool] = False
@@ -217,8 +219,9 @@ class Effect(ABC):
         return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """Coefficients, of one record when the card says `per_record`; by default those of `estimated`."""
-        return self.estimated
+        """Coefficients, of one record when the card says `per_record`; by default those of `estimated`,
+        of every device where they are `per_device`."""
+        return of_devices(ranges, self.estimated) if self.per_device else self.estimated
 
     @classmethod
     def applies(cls, layout: Layout) -> bool:
@@ -347,13 +350,12 @@ def single(
     return (Coefficient(name, unit, scale, one_signed or share, share=share),)
 
 
-def per_device(ranges: Ranges, one: Coefficient) -> tuple[Coefficient, ...]:
-    """A coefficient for every device that reads responses, named after its first axis where there are
-    several: axes of one unit share it."""
+def of_devices(ranges: Ranges, shared: Sequence[Coefficient]) -> tuple[Coefficient, ...]:
+    """Coefficients of every device in turn, named after its first axis where there are several."""
     _, first = np.unique(ranges.devices, return_index=True)
     if first.size == 1:
-        return (one,)
-    return tuple(replace(one, name=f"{one.name}_{ranges.names[axis]}") for axis in first)
+        return tuple(shared)
+    return tuple(replace(one, name=f"{one.name}_{ranges.names[axis]}") for axis in first for one in shared)
 
 
 def devices_of(units: Sequence[str]) -> Index:

@@ -21,7 +21,6 @@ from lcopa_bayes.model.effects.effect import (
     ScatterEffect,
     Scene,
     per_axis,
-    per_device,
     single,
 )
 
@@ -32,6 +31,8 @@ class GainDrift(ReadoutEffect):
 
     linear = True
     affine = True
+    per_device = True
+    estimated = single("d", 0.03)
     card: ClassVar[Card] = Card(
         name="gain_drift",
         place="noise",
@@ -40,10 +41,6 @@ class GainDrift(ReadoutEffect):
         reveals="repeats over time",
         mistaken_for="pointing_offset",
     )
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """d of every device."""
-        return per_device(ranges, Coefficient("d", "-", 0.03))
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""

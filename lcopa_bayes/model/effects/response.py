@@ -9,15 +9,7 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.model.effects.effect import (
-    Card,
-    Coefficient,
-    Ranges,
-    ReadoutEffect,
-    Scene,
-    per_device,
-    single,
-)
+from lcopa_bayes.model.effects.effect import Card, Ranges, ReadoutEffect, Scene, single
 from lcopa_bayes.model.layout import Layout
 
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
@@ -31,6 +23,8 @@ class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
     linear = True
+    per_device = True
+    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="odd_curvature",
         place="output",
@@ -39,10 +33,6 @@ class OddCurvature(ReadoutEffect):
         reveals="amplitude series",
         mistaken_for="gain; voltage_knee",
     )
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c of every device."""
-        return per_device(ranges, Coefficient("c", "-", 0.03))
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
@@ -54,6 +44,8 @@ class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
     linear = True
+    per_device = True
+    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="even_curvature",
         place="output",
@@ -62,10 +54,6 @@ class EvenCurvature(ReadoutEffect):
         reveals="amplitude series with sign reversal",
         mistaken_for="gain",
     )
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c of every device."""
-        return per_device(ranges, Coefficient("c", "-", 0.03))
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
@@ -139,6 +127,8 @@ class Clipping(ReadoutEffect):
 
     ratios = RATIO
     linear = True
+    per_device = True
+    estimated = single("c", 0.6, share=True)
     card: ClassVar[Card] = Card(
         name="clipping",
         place="output",
@@ -152,10 +142,6 @@ class Clipping(ReadoutEffect):
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
         """From half the range to its end."""
         return tuple(cls(level) for level in (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.985))
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c of every device."""
-        return per_device(ranges, Coefficient("c", "-", 0.6, one_signed=True, share=True))
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""

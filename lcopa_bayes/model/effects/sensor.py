@@ -14,7 +14,7 @@ from lcopa_bayes.model.effects.effect import (
     Ranges,
     Scene,
     SensorEffect,
-    per_device,
+    of_devices,
     single,
 )
 
@@ -40,7 +40,7 @@ class SensorLag(SensorEffect):
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """Ts of every device [time unit]."""
-        return per_device(ranges, Coefficient("Ts", "time", 2 * ranges.period, one_signed=True))
+        return of_devices(ranges, single("Ts", 2 * ranges.period, "time", one_signed=True))
 
     def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Exact for cubics through four blocks. Ts below 0 has no meaning: NaN."""
