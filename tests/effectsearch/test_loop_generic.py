@@ -74,6 +74,11 @@ def test_effects_are_found_past_a_class_that_is_ahead_of_each(
 
 
 def test_a_class_that_is_ahead_of_all_that_effects_take_together_keeps_its_place() -> None:
+    """A curvature under a wave takes 151 nat, is significant and predicts better; the class takes 932."""
+    bent = study(4, curvature=0.15, late=0.0, wave=0.05)
+    found = loop(bent, library=LIBRARY, sample=False, quick=True, as_stated=True)
+    assert found.names == ()
+    assert [one.chosen for one in found.rounds] == [None]
     drifting = study(4, curvature=0.0, late=0.0, wave=0.05)
     assert names(drifting) == set()
     assert names(replace(drifting, seed=5)) == set()
