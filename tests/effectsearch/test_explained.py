@@ -289,7 +289,9 @@ def test_the_page_says_over_which_plants_its_numbers_are(run: Path, tmp_path: Pa
         "sentence": "Sums of lags.",
         "plants": "Of their draws.",
     }
+    values["parameters"][0]["note"] = "An extrapolation."
     (folder / "loop.json").write_text(json.dumps(values))
     page = write_page_of("loop", folder).read_text("utf-8")
+    assert page.count(f"{values['parameters'][0]['name']}: An extrapolation.") == 1
     assert ("Gains and delays above are over the same plants" in page) == (support != "plant")
     assert page.count("Of their draws.") == 1
