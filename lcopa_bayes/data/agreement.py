@@ -124,10 +124,11 @@ def disagreements(records: Sequence[Record], crew: Crew = ALONE) -> tuple[Disagr
     for one in rest:
         others = tuple(other for other in rest if other is not one)
         single = others if len(rest) <= _PAIRED else ()
-        comparisons = [_Comparison(one, (other,), delay) for other in single]
+        together = _Comparison(one, others, delay)
+        comparisons = [_Comparison(one, (other,), delay, together) for other in single]
         if any(comparison.judged for comparison in comparisons):
             pairs += [seen for each in comparisons if (seen := each.disagreement()) is not None]
-        elif (seen := _Comparison(one, others, delay).disagreement()) is not None:
+        elif (seen := together.disagreement()) is not None:
             joint.append(seen)
     # what one record contradicts in all others together, these contradict in it
     return (*ahead, *_once(sorted(pairs, key=_severity)), *sorted(joint, key=_severity)[:1])
@@ -233,6 +234,8 @@ class _Comparison:
     others: tuple[Described, ...]
     delay: float
     """Of the whole campaign [time unit]."""
+    together: _Comparison | None = None
+    """The record beside all others, where `others` is one of them."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -306,11 +309,22 @@ class _Comparison:
         for i, j in combinations(range(drives), 2):
             yield _with_exchanged(drives, i, j), tuple(range(responses))
 
+    @property
+    def _as_is(self) -> float:
+        """Share that is missed of the record as it is [-]; NaN where a drive moves in it alone.
+
+        A record that moves one drive says nothing of one that moves another, which may respond much alike:
+        all others together tell that from exchanged columns.
+        """
+        if self.ratios or self.together is None:
+            return _missed(self.ratios) if self.ratios else np.nan
+        return self.together._as_is
+
     def disagreement(self) -> Disagreement | None:
         """The most severe one; None where the record agrees or cannot be judged."""
         orders = {order: _missed(self._ratios(order)) for order in self._exchanges()}
         order = min(orders, key=lambda order: orders[order], default=None)
-        as_is = _missed(self.ratios)
+        as_is = self._as_is if order else np.nan
         if order and as_is > 1 - FOLLOWED > orders[order] and as_is > _EXCHANGED * orders[order]:
             which, name = _exchanged(self.one.record, order), self.one.record.name
             seen = f"record {name!r} follows {self._them} with its {which} exchanged, not as it is"

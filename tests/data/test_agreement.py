@@ -142,6 +142,30 @@ def test_exchanged_axes_are_recognised(role: str) -> None:
     assert f"{role}s 'x' and 'y'" in one.reason
 
 
+def one_at_a_time(*, similar: bool) -> list[Record]:
+    """Two drives of one response, each alone in two records."""
+    first, second = path(2.0, 0.7, (1.5,), (0.9,)), path(1.9 if similar else -0.6, 0.7, (1.5,), (0.9,))
+    device = replace(ONE, paths=((first, second),), drive_axes=TWO.drive_axes)
+    return [
+        record(seed, device=device, command=on_off(to, hold=hold, at=0.35), duration=20.0, name=f"r{seed}")
+        for seed, (to, hold) in enumerate(
+            (((1.0, 0.0), 5.0), ((0.5, 0.0), 9.0), ((0.0, 1.0), 4.0), ((0.0, 0.6), 8.0))
+        )
+    ]
+
+
+def test_drives_that_move_one_after_the_other_and_act_alike_are_not_exchanged() -> None:
+    """What one drive does predicts what another does, but each has records that show it is the other."""
+    assert disagreements(one_at_a_time(similar=True)) == ()
+    assert disagreements(one_at_a_time(similar=True)[1:3]) == ()  # nothing tells
+    records = one_at_a_time(similar=False)
+    assert disagreements(records) == ()
+    wrong = replace(records[1], drive=records[1].drive[:, ::-1])
+    (said,) = disagreements([records[0], wrong, *records[2:]])
+    assert said.records[0] == "r1"
+    assert "drives 'x' and 'y' exchanged" in said.reason
+
+
 @settings(max_examples=15, deadline=None)
 @given(ahead=st.floats(1.5, 3.0), seed=st.integers(0, 99))
 def test_a_response_ahead_of_its_drive_is_recognised_with_its_lead(ahead: float, seed: int) -> None:
