@@ -77,6 +77,13 @@ class BaseFit:
         """Samples that the noise of each axis is known from, 0 where it was fitted jointly [-]."""
         return tuple(one.samples if one.known else 0 for one in self.noise)
 
+    def with_plant(self, model: ExtendedModel, x: Vector) -> BaseFit:
+        """Another plant of the same records under the same noise, at the optimum from coordinates."""
+        regression = Regression(model, self.regression.whitening)
+        optimum = regression.descend(x)
+        failed, caution = _failure(model, optimum), _cautions(self.noise, optimum)
+        return BaseFit(model, self.noise, regression, optimum, failed, caution)
+
     @property
     def noise_known(self) -> bool:
         """Whether the noise of every axis was measured apart from the fit."""

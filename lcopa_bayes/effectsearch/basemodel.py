@@ -24,6 +24,12 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, on, shift_by_width
 from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.spareterms import (
+    counts_of,
+    terms_in_words,
+    without_spare_terms,
+    without_static_terms,
+)
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
@@ -57,6 +63,15 @@ class Base(NamedTuple):
     """Plants that contain it and were not chosen."""
     look: Round | None = None
     """What it leaves; None where nobody looked yet."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of terms of each element [-], by name."""
+        return counts_of(self.problem.posterior.table)
+
+    def of(self, problem: Problem, fit: BaseFit) -> Base:
+        """With another plant of its records; itself where the fit is its own."""
+        return self if fit is self.fit else Base(problem, fit, _state(problem.study, fit), self.sentence)
 
     def on(self, problem: Problem) -> Base:
         """The same on the blocks of a problem where these are narrower; nobody looked at what it leaves
@@ -114,32 +129,37 @@ def fitted_base(
     base, study = separate if mended is None and later is None else _apart(study, base, crew)
     for terms in range(2, _MOST + 1):
         try:
-            wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms, crew)
+            every = _wider(_with_terms(base, terms), base, terms, crew)
+            wider = every.of(*without_spare_terms(every.problem, every.fit, base.fit))
+            dynamic = every.of(*without_static_terms(every.problem, every.fit, base.fit))
         except (ArithmeticError, InputError):  # not simulated, or more parameters than samples
             break
+        wider = every if wider.fit.failed else wider
+        larger = wider, dynamic, every
         gain = _gain(base, wider)
         if base.fit.smooth and rival < wider.fit.optimum.power:
             break
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
                 continue
-            base = _beside(base, wider)
+            base = _beside(base, *larger)
             break
+        counts = terms_in_words(wider.counts)
         if base.fit.failed:
-            said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
+            said = f"The base model has {counts}, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
             base, named = _named(base, library, rng, draws, crew, rival=gain)
             if named is not None and named.log_bayes_factor >= gain:
                 wider, richer = _named(wider, library, rng, draws, crew)
                 if not _gain(base, wider, named, richer) > _GAIN:
-                    base = _beside(base, wider)
+                    base = _beside(base, *larger)
                     break
             said = (
-                f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth "
-                f"{gain:.0f} nat, and explains more, alone or beside an effect, than an effect in its place."
+                f"The base model has {counts}: with fewer it is worth {gain:.0f} nat less, and what is added "
+                "explains more, alone or beside an effect, than an effect in its place."
             )
-        base = wider._replace(sentence=f"{base.sentence} {said}".strip())
+        base = _beside(wider._replace(sentence=f"{base.sentence} {said}".strip()), *larger)
     return base
 
 
@@ -164,11 +184,11 @@ def beside_effects(base: Base, searched: Search) -> Base | None:
             best, worth = wider, gain
     if best is None:
         return None
-    terms, before = (one.problem.study.model.terms for one in (best, base))
+    terms, before = (terms_in_words(one.counts) for one in (best, base))
     said = "Every path has an element and a delay of its own"
-    said = said if terms == before else f"The base model has {terms} viscous terms instead of {before}"
+    said = said if terms == before else f"The base model has {terms}"
     names = listed([effect.name for effect in chosen.model.effects])
-    said += f": beside {names} that is worth {worth:.0f} nat, though not without."
+    said += f": beside {names} what is added is worth {worth:.0f} nat, though not without."
     return best._replace(sentence=f"{base.sentence} {said}".strip())
 
 
@@ -189,9 +209,22 @@ def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:
     return wider._replace(sentence=f"{base.sentence} {said}".strip()), apart
 
 
-def _beside(base: Base, wider: Base) -> Base:
-    """A base fit with a wider one that it is preferred to, unless that has failed."""
-    return base if wider.fit.failed else base._replace(richer=(*base.richer, wider))
+def _beside(base: Base, *wider: Base) -> Base:
+    """A base fit with wider ones that it is preferred to, of those that have not failed, each once."""
+    kept = [*base.richer]
+    for one in wider:
+        if not one.fit.failed and all(one.counts != other.counts for other in (base, *kept)):
+            kept.append(one)
+    return base._replace(richer=tuple(kept))
+
+
+def _with_terms(base: Base, terms: int) -> Study:
+    """The study of a base fit with so many terms in the elements that have the most."""
+    study, most = base.problem.study, max(base.counts.values())
+    if len(set(base.counts.values())) == 1:
+        return replace(study, model=replace(study.model, terms=terms))
+    counts = {name: terms if own == most else own for name, own in base.counts.items()}
+    return replace(study, model=replace(study.model, terms=counts))
 
 
 def _wider(study: Study, base: Base, terms: int, crew: Crew = ALONE) -> Base:

@@ -29,12 +29,16 @@ class OtherPlant:
     state: State
     gained: float
     """Log likelihood over that of the chosen one [nat]."""
+    log_bayes_factor: float
+    """Laplace evidence over that of the chosen one [nat]."""
 
     @classmethod
     def beside(cls, chosen: State, model: ExtendedModel, optimum: Optimum) -> Self:
         """At its optimum, beside the chosen plant at its own."""
         squares = (at.white @ at.white for at in (chosen.optimum, optimum))
-        return cls(State(model, optimum, chosen.whitening), float(np.subtract(*squares)) / 2)
+        ordering = model.plant.table.log_support - chosen.model.plant.table.log_support
+        evidence = optimum.log_evidence - chosen.optimum.log_evidence + ordering
+        return cls(State(model, optimum, chosen.whitening), float(np.subtract(*squares)) / 2, evidence)
 
     @cached_property
     def draws(self) -> Matrix:

@@ -12,7 +12,7 @@ from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.integerplants import IntegerPlant, integer_plant
 from lcopa_bayes.effectsearch.lags import fitted_plant
 from lcopa_bayes.effectsearch.openeffects import Weighed
-from lcopa_bayes.effectsearch.richerplants import WEIGHT, RicherPlants
+from lcopa_bayes.effectsearch.richerplants import RicherPlants
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
@@ -61,10 +61,10 @@ class PlantsBeside:
     def shares(self) -> tuple[tuple[str, float], ...]:
         """Each plant in words, and its share of the draws of all [-]; the chosen one first."""
         richer = self.richer.said
-        left = 1 - WEIGHT if richer else 1.0
+        left = 1 - self.richer.weight
         integer = 0.0 if self.integer is None else left * self.integer.weight
         beside = [] if self.integer is None else [(f"a plant with {self.integer.said}", integer)]
-        beside += [(f"a plant of {said}", WEIGHT / len(richer)) for said in richer]
+        beside += [(f"a plant of {said}", self.richer.weight / len(richer)) for said in richer]
         return ("the plant chosen", left - integer), *beside
 
     @property
