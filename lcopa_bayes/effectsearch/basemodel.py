@@ -24,15 +24,11 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, on, shift_by_width
 from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.spareterms import (
-    counts_of,
-    terms_in_words,
-    without_spare_terms,
-    without_static_terms,
-)
+from lcopa_bayes.effectsearch.spareterms import without_spare_terms, without_static_terms
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
+from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.discretisation import narrowed

@@ -20,7 +20,8 @@ from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.spareterms import counts_of, static_elements, terms_in_words
+from lcopa_bayes.effectsearch.spareterms import static_elements
+from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
 from lcopa_bayes.inference.parameter import Parameter
 
 WEIGHT, _MOST = 0.2, 0.5

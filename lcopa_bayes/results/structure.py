@@ -16,6 +16,7 @@ from math import log
 from time import monotonic
 from typing import Any, final
 
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.progress import Progress
@@ -23,7 +24,8 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.elementterms import counts_of, further, reduced, terms_in_words
+from lcopa_bayes.inference.optimum import Optimum, optima_near
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.results.firstlook import FirstLook, look_at, searched
@@ -51,10 +53,14 @@ class Looked:
         return self.problem.study
 
     @property
+    def table(self) -> ParameterTable:
+        """Its parameters."""
+        return self.problem.posterior.table
+
+    @property
     def name(self) -> str:
         """In words."""
-        layout, terms = self.problem.posterior.table.layout, self.study.model.most_terms
-        parts = [f"{terms} term{'s' * (terms > 1)}"]
+        layout, parts = self.table.layout, [terms_in_words(counts_of(self.table))]
         if len(layout.drives) * len(layout.responses) > 1:
             parts += [f"elements: {len(layout.elements)}", f"delays: {len(layout.delays)}"]
         return ", ".join(parts)
@@ -129,10 +135,48 @@ def structure_of(study: Study, *, jobs: int = 1, quiet: bool = True) -> Structur
             best = Structure(tuple(looked)).chosen.study.model
             model = next((one for one in _beside(best, least) if one not in tried), None)
             if model is None:
-                return Structure(tuple(looked))
+                return Structure((*looked, *_by_element(looked, jobs)))
             tried.append(model)
             more = _if_possible(replace(least, model=model), looked, jobs)
             looked += [] if more is None else [more]
+
+
+def _by_element(looked: Sequence[Looked], jobs: int) -> Iterator[Looked]:
+    """Structures in which single elements have a term that all have in the best one, or in that with one term
+    more, where they are better than the best."""
+    best = Structure(tuple(looked)).chosen
+    own, terms = best.study.model, best.study.model.most_terms
+    uniform = {
+        one.study.model.most_terms: one
+        for one in looked
+        if replace(one.study.model, terms=terms) == own  # what paths share is equal
+    }
+    for most in (terms, terms + 1):
+        if most in uniform and most - 1 in uniform:
+            one = _thinned(uniform[most], uniform[most - 1])
+            if one.bic < best.bic:
+                contained = uniform[most - 1].problem.posterior, uniform[most - 1].optima[0]
+                yield Looked(*searched(one.study, [contained], jobs=jobs))
+
+
+def _thinned(one: Looked, smaller: Looked) -> Looked:
+    """A structure without the terms of single elements that cost more than they bring beside those of a
+    smaller one: those that are missed least are taken out first."""
+    names = further(one.table, smaller.table)
+    for name in sorted(names, key=lambda name: -_with_fewer(one, smaller, name)[2]):
+        problem, start, _ = _with_fewer(one, smaller, name)
+        optima = optima_near(problem.posterior, [start])
+        fewer = Looked(problem, optima)
+        one = fewer if optima and fewer.bic <= one.bic else one
+    return one
+
+
+def _with_fewer(one: Looked, smaller: Looked, element: str) -> tuple[Problem, Vector, float]:
+    """Problem and table values with the terms of a smaller plant in an element, and their log likelihood
+    [nat]."""
+    theirs = smaller.optima[0].values
+    problem, start = reduced(one.problem, one.optima[0].values, smaller.table, theirs, {element})
+    return problem, start, float(problem.posterior.joint_log_likelihood(start[None])[0])
 
 
 def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:

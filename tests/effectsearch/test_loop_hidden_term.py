@@ -47,7 +47,7 @@ def test_a_term_that_an_effect_hides_is_found_beside_it():
     found = loop(study(1, LIMIT), library=LIBRARY, sample=False, quick=True)
     assert found.verdict.kind == "explained"
     assert found.names == ("clipping",)
-    assert "2 viscous terms: beside clipping what is added is worth" in found.enlarged
+    assert "2 terms: beside clipping what is added is worth" in found.enlarged
     ends = {one.name: np.quantile(one.values, (0.005, 0.995)) for one in found.figures}
     low, high = ends["steady_state[y]"]
     assert low < GAIN < high

@@ -17,13 +17,12 @@ from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.spareterms import (
-    counts_of,
     static_elements,
-    terms_in_words,
     without_spare_terms,
     without_static_terms,
 )
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
 
 RESPONSES = TWO.response_axes
 TWO_TERMS, ONE_TERM = path(1.0, 0.5, (1.0, 2.0), (1.9, 0.7)), path(1.0, 0.5, (1.5,), (0.9,))
@@ -106,7 +105,7 @@ def test_a_loop_chooses_the_terms_of_each_element() -> None:
     one, _, _ = unequal()
     base: Base = fitted_base(replace(one, model=ModelSettings(terms=1)), (), as_stated=False, draws=50)
     assert base.counts == {"x_u": 2, "y_u": 1}
-    assert "2 viscous terms in x_u, and 1 in the others" in base.sentence
+    assert "2 terms in x_u, and 1 in the others" in base.sentence
     for wider in base.richer:
         assert wider.counts != base.counts
         assert all(wider.counts[name] >= terms for name, terms in base.counts.items())
@@ -115,10 +114,10 @@ def test_a_loop_chooses_the_terms_of_each_element() -> None:
 @pytest.mark.parametrize(
     ("counts", "words"),
     [
-        ({"": 1}, "1 viscous term"),
-        ({"a": 2, "b": 2}, "2 viscous terms"),
-        ({"a": 2, "b": 1, "c": 2}, "2 viscous terms in a, c, and 1 in the others"),
-        ({"a": 3, "b": 1, "c": 2}, "3 viscous terms in a, and 1 or 2 in the others"),
+        ({"": 1}, "1 term"),
+        ({"a": 2, "b": 2}, "2 terms"),
+        ({"a": 2, "b": 1, "c": 2}, "2 terms in a, c, and 1 in the others"),
+        ({"a": 3, "b": 1, "c": 2}, "3 terms in a, and 1 or 2 in the others"),
     ],
 )
 def test_terms_in_words(counts: dict[str, int], words: str) -> None:

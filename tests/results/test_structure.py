@@ -141,6 +141,26 @@ def test_paths_that_share_nothing_are_recognised_before_terms_are_added() -> Non
     assert {"2 terms, elements: 4, delays: 4", "1 term, elements: 2, delays: 4"} <= beside
 
 
+def test_a_term_is_chosen_for_the_element_that_needs_it() -> None:
+    """The first response rings and creeps, the second is a lag: one term of all is worse, and so are two."""
+    paths = ((path(1.0, 0.5, (1.0, 2.0), (1.9, 0.7)),), (path(1.0, 0.5, (1.5,), (0.9,)),))
+    device = Device(paths, (Axis("u", "V"),), TWO.response_axes, (0.0, 0.0))
+    moves = (on_off(1.0, hold=9.0, at=0.5), on_off(-0.5, hold=4.0, at=0.5))
+    records = [
+        record(k, device=device, command=move, camera=0.25, duration=20.0, noise_sd=0.004, name=f"r{k}")
+        for k, move in enumerate(moves)
+    ]
+    structure = structure_of(study(*records, terms="auto"))
+    assert structure is not None
+    assert structure.chosen.name == "2 terms in x_u, and 1 in the others, elements: 2, delays: 2"
+    assert structure.chosen.study.model.terms == {"x_u": 2, "y_u": 1}
+    others = [one for one in structure.looked if one is not structure.chosen]
+    assert all(one.bic > structure.chosen.bic for one in others)
+    richer = next(one for one in others if one.study.model.terms == 2)
+    assert richer.max_log_likelihood >= structure.chosen.max_log_likelihood - 0.5
+    assert richer.parameters == structure.chosen.parameters + 2
+
+
 def test_priors_need_terms_and_unknown_ones_are_refused() -> None:
     made = steps(ONE)
     both = replace(made, priors=study(record(), terms=2, priors={"order_2": 0.5}).priors)

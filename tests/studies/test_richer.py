@@ -95,7 +95,7 @@ def test_its_part_is_the_stated_weight(found: Loop) -> None:
     shares = [share for _, share in alone.plants.shares]
     assert alone.number(names.index("gain")).weights[-1] == pytest.approx(shares[-1])
     assert sum(shares) == pytest.approx(1.0)
-    share = f"{100 * weight:.0f} % of a plant of one element with 3 viscous terms"
+    share = f"{100 * weight:.0f} % of a plant of one element with 3 terms"
     assert share in alone.plants.sentence
     steady = next(one for one in alone.figures if one.name == "steady_state[y1]")
     own = steady.parts[-1]
