@@ -154,7 +154,7 @@ def _by_element(looked: Sequence[Looked], jobs: int) -> Iterator[Looked]:
     for most in (terms, terms + 1):
         if most in uniform and most - 1 in uniform:
             one = _thinned(uniform[most], uniform[most - 1])
-            if one.bic < best.bic:
+            if len(set(counts_of(one.table).values())) > 1 and one.bic < best.bic:
                 contained = uniform[most - 1].problem.posterior, uniform[most - 1].optima[0]
                 yield Looked(*searched(one.study, [contained], jobs=jobs))
 

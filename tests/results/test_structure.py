@@ -137,6 +137,7 @@ def test_paths_that_share_nothing_are_recognised_before_terms_are_added() -> Non
     assert structure.chosen.name == "1 term, elements: 4, delays: 4"
     models = [one.study.model for one in structure.looked]
     assert all(models.count(model) == 1 for model in models)
+    assert all(isinstance(model.terms, int) for model in models)  # no element by itself needs another one
     beside = {one.name for one in structure.looked}
     assert {"2 terms, elements: 4, delays: 4", "1 term, elements: 2, delays: 4"} <= beside
 
