@@ -311,14 +311,13 @@ class _Comparison:
 
     @property
     def _as_is(self) -> float:
-        """Share that is missed of the record as it is [-]; NaN where a drive moves in it alone.
+        """Least share that is missed of the record as it is [-]; NaN where a drive moves in it alone.
 
-        A record that moves one drive says nothing of one that moves another, which may respond much alike:
-        all others together tell that from exchanged columns.
+        A record that moves one drive says nothing of one that moves another, which may respond much alike,
+        and one that moves both at once tells them apart badly: all others together know it better.
         """
-        if self.ratios or self.together is None:
-            return _missed(self.ratios) if self.ratios else np.nan
-        return self.together._as_is
+        known = (one for one in (self, self.together) if one is not None and one.ratios)
+        return min((_missed(one.ratios) for one in known), default=np.nan)
 
     def disagreement(self) -> Disagreement | None:
         """The most severe one; None where the record agrees or cannot be judged."""

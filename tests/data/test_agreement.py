@@ -12,7 +12,8 @@ from numpy.testing import assert_array_equal
 from shapes import SHAPES
 from small import ONE, TWO, path, record, study
 
-from lcopa_bayes.bench.command import on_off, staircase, step
+from lcopa_bayes.bench.command import joint, on_off, prbs, staircase, step
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
 from lcopa_bayes.data.drive import moved_with_drive
@@ -142,10 +143,15 @@ def test_exchanged_axes_are_recognised(role: str) -> None:
     assert f"{role}s 'x' and 'y'" in one.reason
 
 
-def one_at_a_time(*, similar: bool) -> list[Record]:
-    """Two drives of one response, each alone in two records."""
+def device_of(*, similar: bool) -> Device:
+    """Two drives of one response."""
     first, second = path(2.0, 0.7, (1.5,), (0.9,)), path(1.9 if similar else -0.6, 0.7, (1.5,), (0.9,))
-    device = replace(ONE, paths=((first, second),), drive_axes=TWO.drive_axes)
+    return replace(ONE, paths=((first, second),), drive_axes=TWO.drive_axes)
+
+
+def one_at_a_time(*, similar: bool) -> list[Record]:
+    """Each drive alone in two records."""
+    device = device_of(similar=similar)
     return [
         record(seed, device=device, command=on_off(to, hold=hold, at=0.35), duration=20.0, name=f"r{seed}")
         for seed, (to, hold) in enumerate(
@@ -158,6 +164,10 @@ def test_drives_that_move_one_after_the_other_and_act_alike_are_not_exchanged() 
     """What one drive does predicts what another does, but each has records that show it is the other."""
     assert disagreements(one_at_a_time(similar=True)) == ()
     assert disagreements(one_at_a_time(similar=True)[1:3]) == ()  # nothing tells
+    rng = np.random.default_rng(0)  # a drive that tells the two so badly that another one is predicted better
+    both = joint(*(prbs(0.0, 1.5, hold=hold, duration=20.0, rng=rng, start=0.35) for hold in (3, 4)))
+    switched = record(9, device=device_of(similar=True), command=both, duration=20.0, name="switched")
+    assert disagreements([*one_at_a_time(similar=True), switched]) == ()
     records = one_at_a_time(similar=False)
     assert disagreements(records) == ()
     wrong = replace(records[1], drive=records[1].drive[:, ::-1])
