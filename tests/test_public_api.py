@@ -22,6 +22,7 @@ import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
+from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.results.runfolder import LOCK, opened, provenance
 from lcopa_bayes.verbs.commandline import RUNS
 
@@ -146,6 +147,8 @@ SHORTER = {
     "second-order": "first-order",
 }
 """What the README's lines ask for, and what takes seconds in its place."""
+FEW = [catalogue()[name] for name in ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")]
+"""Effects that a search is over where what it finds is not the question; `docs/python.md` searches all."""
 
 
 def bent_lag(height: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -156,6 +159,7 @@ def bent_lag(height: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
     return {"time_ms": time_ms, "drive_x_rad": height * (time_ms >= 0), "response_x_rad": reading}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_lines_that_must_work(tmp_path, monkeypatch):
     """The README's Python section, line by line, on a small study with small candidates."""
     (text,) = re.findall(r"^```python\n(.*?)^```$", README.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
@@ -173,6 +177,7 @@ def test_the_lines_that_must_work(tmp_path, monkeypatch):
         assert stated in text
         text = text.replace(stated, small)
     monkeypatch.setattr(lb, "load_study", lambda folder: study)
+    monkeypatch.setattr("lcopa_bayes.effectsearch.loop.offered", lambda study: FEW)
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     results = {}
@@ -216,9 +221,13 @@ def test_a_fit_does_not_depend_on_processes(fit):
     np.testing.assert_array_equal(again.draws.values, fit.draws.values)
 
 
-def test_an_audit_of_a_fit_a_folder_and_a_study_are_one(fit, folder, audit):
+def test_an_audit_of_a_fit_and_of_its_folder_are_one(fit, folder, audit):
     assert set(audit.summary()["parameter"]) == set(fit.summary()["parameter"])
     assert lb.audit(folder, quick=True).to_json() == audit.to_json()
+
+
+@pytest.mark.slow
+def test_an_audit_of_a_study_is_that_of_its_fit(audit):
     assert lb.audit(small(), quick=True).to_json() == audit.to_json()
 
 
@@ -321,18 +330,21 @@ def test_a_study_its_records_and_a_drive_show_what_they_hold_and_not_their_numbe
 # ---- run folders
 
 
-def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, capsys):
+@pytest.mark.usefixtures("undrawn")
+def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lcopa_bayes.effectsearch.loop.offered", lambda study: FEW)
     run = tmp_path / "run"
     lb.load_result(folder).save(run)
     draws = (run / "posterior.nc").read_bytes()
-    assert main(["audit", str(run), "--quick", "--quiet"]) == 0
+    words = ["--quick", "--quiet", "--jobs", "1"]
+    assert main(["audit", str(run), *words]) == 0
     drawn = (run / "report.html").stat().st_mtime_ns
-    assert main(["loop", str(run), "--quick", "--as-stated", "--quiet"]) == 0
+    assert main(["loop", str(run), "--as-stated", *words]) == 0
     assert (run / "posterior.nc").read_bytes() == draws  # not fitted again
     assert (run / "report.html").stat().st_mtime_ns == drawn  # nor drawn again
     origins = json.loads((run / "provenance.json").read_text())
     assert list(origins) == ["fit", "audit", "loop"]
-    assert origins["audit"]["command"] == ["lcopa-bayes", "audit", str(run), "--quick", "--quiet"]
+    assert origins["audit"]["command"] == ["lcopa-bayes", "audit", str(run), *words]
     assert origins["loop"]["command"][:2] == ["lcopa-bayes", "loop"]
     assert origins["fit"]["records_sha256"].keys() == {"on"}
     assert lb.load_result(run).verb == "loop"

@@ -46,6 +46,8 @@ pytestmark = [
 ]
 CORPUS = Path(__file__).parent / "corpus"
 DEFAULT = 20_000
+SHORT = 1_500
+"""Inputs of one reader where no more than the default are asked for."""
 INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", DEFAULT))
 MOST = 5.0
 """Longest time that one input may take [s]."""
@@ -203,9 +205,10 @@ def mutated(*seeds: bytes) -> st.SearchStrategy[bytes]:
 
 
 def many(share: float) -> Callable[[Callable], Callable]:
-    """So much of all inputs."""
+    """So much of all inputs, and few of them in the short form."""
+    wanted = max(1, int(share * INPUTS))
     return settings(
-        max_examples=max(1, int(share * INPUTS)),
+        max_examples=wanted if INPUTS > DEFAULT else min(wanted, SHORT),
         deadline=None,  # `refused_or` has its own, which a reader that hangs does not outlast
         database=None,
         derandomize=INPUTS <= DEFAULT,

@@ -29,7 +29,7 @@ gain = { dist = "uniform", loc = 0, scale = 10 }
 [noise]
 kind = "white"
 [sampler]
-target_ess = 100
+target_ess = 50
 """
 VERDICTS = {
     *("identified", "one-sided", "practically unidentifiable", "structurally unidentifiable"),
@@ -46,9 +46,10 @@ def study(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(study) -> Path:
+def run(study, undrawing) -> Path:
     folder = study / "run"
-    assert main(["audit", str(study), "--quick", "--jobs", "1", "--quiet", "--out", str(folder)]) == 0
+    with undrawing():
+        assert main(["audit", str(study), "--quick", "--jobs", "1", "--quiet", "--out", str(folder)]) == 0
     return folder
 
 
