@@ -141,13 +141,14 @@ thin = 1
 
 
 @pytest.fixture(scope="module")
-def sampled(tmp_path_factory) -> list[str]:
+def sampled(tmp_path_factory, undrawing) -> list[str]:
     """The command of a run whose sampling is done, so that repeating it with --resume is quick."""
     folder = tmp_path_factory.mktemp("study")
     save_record(record(camera=0.8), folder / "a.csv")
     (folder / "study.toml").write_text(STUDY)
     command = ["fit", str(folder / "study.toml"), "--jobs", "1", "--quiet", "--out", str(folder / "out")]
-    assert main(command) == 0
+    with undrawing():
+        assert main(command) == 0
     return [*command, "--resume"]
 
 

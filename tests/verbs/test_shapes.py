@@ -23,14 +23,17 @@ SEARCHED = {
     ),
     "1x2, dark record": Shape(samples=30, drives=2, dark=True, settings=PLAIN),
     "2x1, missing cells": Shape(samples=30, responses=2, missing=0.3, settings=PLAIN),
+    "2x1, missing cells, no sample at rest, hours": Shape(
+        samples=30, responses=2, missing=0.3, unit="s", second=9_000.0, early=True, settings=PLAIN
+    ),
     "2x2": Shape(samples=30, responses=2, drives=2, settings=PLAIN),
     "no sample at rest, hours": Shape(
         samples=30, unit="s", second=9_000.0, early=True, records=3, jitter=0.5, settings=PLAIN
     ),
     "microseconds": Shape(samples=30, unit="s", second=2e-6, records=3, drift=0.1, settings=PLAIN),
 }
-SHORT = ("2x1, missing cells", "no sample at rest, hours")
-"""Of them those that the short form searches."""
+SHORT = ("2x1, missing cells, no sample at rest, hours",)
+"""Of them what the short form searches: two kinds in one."""
 LOOKED_AT = ("1x2", "2x1, jittered clock", "no sample at rest", "few samples", "eight bits")
 LOOKED_AT += ("microseconds, dark record",)
 """Shapes that the short form looks at."""
