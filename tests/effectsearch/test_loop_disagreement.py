@@ -10,6 +10,7 @@ from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.summary import results, words
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 
 def scaled(one: Record, factor: float) -> Record:
@@ -55,7 +56,9 @@ def test_no_effect_is_named_from_records_that_no_plant_follows(name):
 
 def test_records_of_two_plants_are_named_beside_what_is_traced():
     """20 standard errors apart: both records are named, whatever the verdict."""
-    found = loop(study(ON, scaled(HALF, 1.3)), sample=False, quick=True, as_stated=True)
+    library = [catalogue()[name] for name in ("odd_curvature", "gain_drift", "unmodelled_smooth")]
+    made = study(ON, scaled(HALF, 1.3))
+    found = loop(made, library=library, sample=False, quick=True, as_stated=True)
     (said,) = (one for one in found.cautions if one.startswith("records disagree"))
     assert "'half'" in said
     assert "'on'" in said

@@ -60,7 +60,9 @@ def names(one: Study) -> set[str]:
     return set(found.names)
 
 
-@pytest.mark.parametrize(("seed", "curvature", "late"), [(3, 0.15, 0.2), (5, 0.1, 0.15)])
+@pytest.mark.parametrize(
+    ("seed", "curvature", "late"), [(3, 0.15, 0.2), pytest.param(5, 0.1, 0.15, marks=pytest.mark.slow)]
+)
 def test_effects_are_found_past_a_class_that_is_ahead_of_each(
     monkeypatch: pytest.MonkeyPatch, seed: int, curvature: float, late: float
 ) -> None:
@@ -79,6 +81,8 @@ def test_a_class_that_is_ahead_of_all_that_effects_take_together_keeps_its_place
     found = loop(bent, library=LIBRARY, sample=False, quick=True, as_stated=True)
     assert found.names == ()
     assert [one.chosen for one in found.rounds] == [None]
-    drifting = study(4, curvature=0.0, late=0.0, wave=0.05)
-    assert names(drifting) == set()
-    assert names(replace(drifting, seed=5)) == set()
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
+def test_a_wave_alone_gives_no_name(seed: int) -> None:
+    assert names(replace(study(4, curvature=0.0, late=0.0, wave=0.05), seed=seed)) == set()

@@ -100,7 +100,8 @@ def test_a_residual_without_independent_samples_names_nothing():
     record = Record("walk", t, drive[:, None], y[:, None], AXIS, AXIS, "ms")
     early = replace(record, time=t[30:], drive=drive[30:, None], response=y[30:, None])
     study = Study("walk", None, "ms", 5, (early,), (), ModelSettings(offset="shared"))
-    found = loop(study, sample=False, quick=True, as_stated=True)
+    library = [catalogue()[name] for name in ("odd_curvature", "pointing_drift", "unmodelled_smooth")]
+    found = loop(study, library=library, sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "unexplained"
     assert "independent ones" in found.base.failed
     assert found.effects == ()

@@ -21,6 +21,7 @@ from lcopa_bayes.data.studywriter import write_folder
 from lcopa_bayes.fleets.devices import row_of
 from lcopa_bayes.fleets.summary import _shares, results
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.results import fit as fits
 from lcopa_bayes.verbs import fleet as verb
 
@@ -343,7 +344,9 @@ def test_the_bench_makes_a_fleet_of_a_known_population_with_odd_devices(tmp_path
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path):
+def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path, monkeypatch):
+    few = [catalogue()[name] for name in ("odd_curvature", "gain_drift", "unmodelled_smooth")]
+    monkeypatch.setattr("lcopa_bayes.effectsearch.loop.offered", lambda study: few)
     found = lb.fleet([lb.load_study(devices / "a")], "loop", quick=True, folder=tmp_path)
     (row,) = found.summary().to_dict("records")
     own = lb.load_result(tmp_path / "devices" / "a", "loop")

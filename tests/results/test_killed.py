@@ -42,7 +42,8 @@ def studies(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(studies, tmp_path_factory) -> dict:
-    return kill.reference("fleet", studies, tmp_path_factory.mktemp("runs") / "fleet", jobs=2)[0]
+    """In one process, as its results do not depend on how many there are."""
+    return kill.reference("fleet", studies, tmp_path_factory.mktemp("runs") / "fleet", jobs=1)[0]
 
 
 @pytest.mark.parametrize(
@@ -85,6 +86,7 @@ def test_what_a_killed_worker_was_writing_is_removed(tmp_path):
         assert (tmp_path / ".part-x.csv").exists() is left
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_pages_are_not_written_while_another_run_writes(tmp_path):
     result = optics(OpticsPlan(targets_deg=(0.0,), voltages=(2.0,)))
     result.save(tmp_path)
