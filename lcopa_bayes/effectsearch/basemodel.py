@@ -28,7 +28,7 @@ from lcopa_bayes.effectsearch.spareterms import without_spare_terms, without_sta
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
-from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
+from lcopa_bayes.inference.elementterms import terms_in_words
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.discretisation import narrowed
@@ -63,7 +63,7 @@ class Base(NamedTuple):
     @property
     def counts(self) -> dict[str, int]:
         """Number of terms of each element [-], by name."""
-        return counts_of(self.problem.posterior.table)
+        return self.problem.posterior.table.layout.terms
 
     def of(self, problem: Problem, fit: BaseFit) -> Base:
         """With another plant of its records; itself where the fit is its own."""

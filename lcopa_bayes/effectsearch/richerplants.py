@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.otherplants import OtherPlant
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.spareterms import static_elements
-from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
+from lcopa_bayes.inference.elementterms import terms_in_words
 from lcopa_bayes.inference.parameter import Parameter
 
 WEIGHT, _MOST = 0.2, 0.5
@@ -91,6 +91,6 @@ class RicherPlants:
 
 
 def _said(one: OtherPlant) -> str:
-    counts = counts_of(one.state.model.plant.table)
+    counts = one.state.model.plant.table.layout.terms
     own = f"{len(counts)} elements" if len(counts) > 1 else "one element"
     return f"{own} with {terms_in_words(counts)} (log likelihood higher by {max(one.gained, 0.0):.1f} nat)"

@@ -216,8 +216,8 @@ def refit(problem: Problem, record: Record, bench: Bench) -> Problem:
 
 
 def _terms(table: ParameterTable) -> int | dict[str, int]:
-    elements = table.layout.elements
-    return elements[0].terms if len(elements) == 1 else {slot.name: slot.terms for slot in elements}
+    terms = table.layout.terms
+    return terms if len(terms) > 1 else next(iter(terms.values()))
 
 
 def _moved(before: Problem, problem: Problem, values: Vector) -> Vector:

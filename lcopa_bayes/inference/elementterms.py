@@ -13,11 +13,6 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 
 
-def counts_of(table: ParameterTable) -> dict[str, int]:
-    """Number of terms of each element [-], by name."""
-    return {slot.name: slot.terms for slot in table.layout.elements}
-
-
 def terms_in_words(counts: Mapping[str, int]) -> str:
     """Numbers of terms [-] of elements by name, as in "2 terms in a, b, and 1 in the others"."""
     most = max(counts.values())
@@ -32,7 +27,7 @@ def terms_in_words(counts: Mapping[str, int]) -> str:
 def further(table: ParameterTable, smaller: ParameterTable) -> set[str]:
     """Names of the elements that have more terms than in a smaller plant; none of a plant of one element,
     whose plant with fewer terms is the smaller one itself."""
-    counts, least = counts_of(table), counts_of(smaller)
+    counts, least = table.layout.terms, smaller.layout.terms
     return {name for name in counts if counts[name] > least[name]} if len(counts) > 1 else set()
 
 
@@ -43,7 +38,7 @@ def reduced(
     these elements, with gains and delays of their paths, as in the smaller plant at `theirs`, all else as at
     `values`, (rows,) each."""
     table = problem.posterior.table
-    counts = counts_of(table) | {name: counts_of(smaller)[name] for name in elements}
+    counts = table.layout.terms | {name: smaller.layout.terms[name] for name in elements}
     settings = problem.study.model.for_plant(len(table.layout.drives), len(table.layout.responses))
     study = replace(problem.study, model=replace(settings, terms=counts))
     fewer = problem_of(study).at_least(problem.refinement)

@@ -83,6 +83,11 @@ class Layout:
         )
 
     @cached_property
+    def terms(self) -> dict[str, int]:
+        """Number of viscous terms of each element [-], by its name."""
+        return {slot.name: slot.terms for slot in self.elements}
+
+    @cached_property
     def units(self) -> tuple[Unit, ...]:
         """Distinct responses that the paths scale by their gains."""
         return tuple(dict.fromkeys(unit for row in self._unit_table for unit in row))

@@ -24,7 +24,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.elementterms import counts_of, further, reduced, terms_in_words
+from lcopa_bayes.inference.elementterms import further, reduced, terms_in_words
 from lcopa_bayes.inference.optimum import Optimum, optima_near
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.layout import Layout
@@ -60,7 +60,8 @@ class Looked:
     @property
     def name(self) -> str:
         """In words."""
-        layout, parts = self.table.layout, [terms_in_words(counts_of(self.table))]
+        layout = self.table.layout
+        parts = [terms_in_words(layout.terms)]
         if len(layout.drives) * len(layout.responses) > 1:
             parts += [f"elements: {len(layout.elements)}", f"delays: {len(layout.delays)}"]
         return ", ".join(parts)
@@ -154,7 +155,7 @@ def _by_element(looked: Sequence[Looked], jobs: int) -> Iterator[Looked]:
     for most in (terms, terms + 1):
         if most in uniform and most - 1 in uniform:
             one = _thinned(uniform[most], uniform[most - 1])
-            if len(set(counts_of(one.table).values())) > 1 and one.bic < best.bic:
+            if len(set(one.table.layout.terms.values())) > 1 and one.bic < best.bic:
                 contained = uniform[most - 1].problem.posterior, uniform[most - 1].optima[0]
                 yield Looked(*searched(one.study, [contained], jobs=jobs))
 

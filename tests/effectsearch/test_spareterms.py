@@ -22,7 +22,7 @@ from lcopa_bayes.effectsearch.spareterms import (
     without_static_terms,
 )
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.elementterms import counts_of, terms_in_words
+from lcopa_bayes.inference.elementterms import terms_in_words
 
 RESPONSES = TWO.response_axes
 TWO_TERMS, ONE_TERM = path(1.0, 0.5, (1.0, 2.0), (1.9, 0.7)), path(1.0, 0.5, (1.5,), (0.9,))
@@ -57,7 +57,7 @@ def unequal() -> tuple[Study, tuple[Problem, BaseFit], tuple[Problem, BaseFit]]:
 def test_the_term_that_no_record_asks_for_is_taken_out() -> None:
     one, (_, smaller), (problem, larger) = unequal()
     thinned, fit = without_spare_terms(problem, larger, smaller)
-    assert counts_of(fit.model.plant.table) == {"x_u": 2, "y_u": 1} == thinned.study.model.terms
+    assert fit.model.plant.table.layout.terms == {"x_u": 2, "y_u": 1} == thinned.study.model.terms
     assert fit.optimum.log_evidence > max(larger.optimum.log_evidence, smaller.optimum.log_evidence)
     # from starts of its own, with noise of its own, that plant is fitted as well and no better
     _, again = fitted(one, {"x_u": 2, "y_u": 1})
@@ -73,7 +73,7 @@ def test_a_plant_of_equal_elements_keeps_them_all_or_none() -> None:
         one = campaign(device, **OWN)
         (_, smaller), (problem, larger) = fitted(one, 1), fitted(one, 2)
         _, fit = without_spare_terms(problem, larger, smaller)
-        assert set(counts_of(fit.model.plant.table).values()) == {kept}
+        assert set(fit.model.plant.table.layout.terms.values()) == {kept}
 
 
 def test_what_paths_share_is_kept_beside_a_term_that_is_taken_out() -> None:
@@ -81,7 +81,7 @@ def test_what_paths_share_is_kept_beside_a_term_that_is_taken_out() -> None:
     one = campaign(TWO, share="paper", delay="shared")
     (_, smaller), (problem, larger) = fitted(one, 1), fitted(one, 2)
     thinned, fit = without_spare_terms(problem, larger, smaller)
-    assert counts_of(fit.model.plant.table) == {"direct": 2, "cross": 1}
+    assert fit.model.plant.table.layout.terms == {"direct": 2, "cross": 1}
     assert (thinned.study.model.share, thinned.study.model.delay) == ("paper", "shared")
     assert fit.model.names.count("delay") == 1
 
@@ -94,7 +94,7 @@ def test_a_static_term_is_taken_out_and_a_plant_of_one_element_is_left_as_it_is(
     static = replace(larger, optimum=replace(larger.optimum, x=larger.model.coordinates(values)))
     assert static_elements(static.model, static.optimum.x) == {"y_u"}
     _, fit = without_static_terms(problem, static, smaller)
-    assert counts_of(fit.model.plant.table) == {"x_u": 2, "y_u": 1}
+    assert fit.model.plant.table.layout.terms == {"x_u": 2, "y_u": 1}
     assert not static_elements(fit.model, fit.optimum.x)
     alone = campaign(replace(ONE, paths=((ONE_TERM,),)))
     (_, small), (problem, large) = fitted(alone, 1), fitted(alone, 2)

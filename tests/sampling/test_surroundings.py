@@ -93,7 +93,7 @@ def test_they_end_after_so_many_rounds_and_say_what_they_may_miss(monkeypatch):
 
 def test_a_budget_of_time_takes_the_place_of_the_most_rounds(monkeypatch):
     monkeypatch.setattr(sampler, "_NEAR_ROUNDS", 2)
-    assert run(monkeypatch, 1e9, seconds=1e9, steps=80).ensembles[0].steps == 80
+    assert run(monkeypatch, 1e9, seconds=1e9, steps=120).ensembles[0].steps == 120
 
 
 def test_a_stored_run_remembers_that_it_began_there(monkeypatch, tmp_path):
