@@ -130,8 +130,7 @@ class Conditional:
         middle, width = [], []
         for k in self.columns:
             row = self.posterior.table.rows[k]
-            assert row.prior is not None
-            low, mid, high = row.prior.frozen.ppf((_QUARTERS[0], 0.5, _QUARTERS[1]))
+            low, mid, high = row.quantiles((_QUARTERS[0], 0.5, _QUARTERS[1]))
             if row.kind == "time":
                 low, mid, high = np.log((low, mid, high))
             middle.append(mid)

@@ -63,8 +63,7 @@ class LeastSquares:
             row = self.posterior.table.rows[k]
             a, b = row.domain
             if row.log_scale and row.prior is not None:  # along a flat direction logarithms run to infinity
-                tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
-                a, b = np.log(max(a, tails[0], 1e-300)), np.log(min(b, tails[1]))
+                a, b = np.log(row.quantiles((_TAIL, 1 - _TAIL)))
             edge = _EDGE * (b - a if np.isfinite(b - a) else 1.0)
             low.append(a + edge)
             high.append(b - edge)

@@ -105,10 +105,10 @@ class Landscape:
         row = self.posterior.table.rows[k]
         assert row.prior is not None
         low, high = row.domain
-        tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
+        tails = row.quantiles((_TAIL, 1 - _TAIL))
         if not (row.log_scale or row.logit_scale):
             mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
-            tails = (mean - _FAR * sd, mean + _FAR * sd) if np.isfinite(sd) else tails
+            tails = np.array([mean - _FAR * sd, mean + _FAR * sd]) if np.isfinite(sd) else tails
         closed = row.log_scale or row.logit_scale  # zero and one are infinitely far away
         if not np.isfinite(low) or (closed and low <= 0.0):
             low = max(low, float(tails[0]))

@@ -212,4 +212,4 @@ class _Lift:
             return np.full(n, row.value)
         if not order.free and order.value > 1.0 and self.large.resolution > 0:
             return np.asarray(self.large.resolution * np.exp(0.5 * self.rng.random(n)))
-        return np.asarray(row.prior.frozen.ppf(self.rng.uniform(*_FAST, n)), dtype=float)
+        return row.quantiles(self.rng.uniform(*_FAST, n))

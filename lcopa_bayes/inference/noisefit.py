@@ -48,14 +48,11 @@ class NoiseFit:
 
     @cached_property
     def ends(self) -> tuple[Vector, Vector]:
-        """Ends of the search: the support of each prior, or where all but 2e-9 of its mass lies."""
+        """Ends of the search: where all but 2e-9 of the mass of each prior lies."""
         low, high = [], []
         for k in self.free:
             row = self.rows[k]
-            assert row.prior is not None
-            tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
-            a, b = row.domain
-            at = row.coordinate(np.array([max(a, tails[0]), min(b, tails[1])]))
+            at = row.coordinate(row.quantiles((_TAIL, 1 - _TAIL)))
             edge = _EDGE * (at[1] - at[0])
             low.append(at[0] + edge)
             high.append(at[1] - edge)

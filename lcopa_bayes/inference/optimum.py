@@ -248,9 +248,10 @@ def known_optimum(posterior: Posterior, values: Vector) -> Optimum | None:
 
 
 def optima_near(posterior: Posterior, starts: Sequence[Vector]) -> tuple[Optimum, ...]:
-    """Optima of a posterior with effects that table values `starts`, (rows,) each, lead to, best first,
-    duplicates removed."""
-    return _kept(posterior, _descended(posterior, _near(posterior, starts)))
+    """Optima of a posterior that table values `starts`, (rows,) each, lead to, best first, duplicates
+    removed; with effects from where slopes of the plant alone lead (`_near`)."""
+    near = starts if posterior.simulation is None else _near(posterior, starts)
+    return _kept(posterior, _descended(posterior, near))
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, log
@@ -139,13 +140,21 @@ class Parameter:
         low, high, at = (float(self.prior.frozen.cdf(end)) for end in (*self.domain, x))
         return float(np.clip((at - low) / (high - low), 0.0, 1.0))
 
+    def quantiles(self, p: Array | Sequence[float]) -> Array:
+        """Quantiles of the prior within the domain, its ends excluded: a prior may reach beyond it, such as
+        a normal one of a scale."""
+        assert self.prior is not None
+        low, high = self._ends
+        below = float(self.prior.frozen.cdf(low))
+        x = self.prior.frozen.ppf(below + self._mass * np.asarray(p))
+        return np.asarray(np.clip(x, np.nextafter(low, high), np.nextafter(high, low)), dtype=float)
+
     def draw(self, size: int, rng: np.random.Generator) -> Vector:
         """Draws from the prior within the domain, or copies of the fixed value."""
         if self.prior is None:
             return np.full(size, self.value)
-        low, high = (float(self.prior.frozen.cdf(end)) for end in self._ends)
-        if high - low < _REJECTION:
-            return np.asarray(self.prior.frozen.ppf(rng.uniform(low, high, size)), dtype=float)
+        if self._mass < _REJECTION:
+            return self.quantiles(rng.random(size))
         out = np.empty(0)
         while out.size < size:
             drawn = self.prior.draw(2 * size, rng)

@@ -215,7 +215,8 @@ def _walked(
         if ess >= wanted:
             break
     kept = chain.reshape(-1, low.size)
-    return kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)], ess
+    picked = rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)
+    return kept[picked], 1 / (1 / ess + 1 / picked.size)
 
 
 @final

@@ -123,8 +123,7 @@ def element_columns(posterior: Posterior) -> tuple[ElementColumns, ...]:
             for j, element in enumerate(row)
             if element == e
         ]
-        priors = [table.rows[k].prior for k in times]
-        reach = np.log([prior.frozen.ppf((1e-4, 1 - 1e-4)) for prior in priors if prior is not None])
+        reach = np.log([table.rows[k].quantiles((1e-4, 1 - 1e-4)) for k in times])
         out.append(
             ElementColumns(
                 e,

@@ -13,10 +13,13 @@ from lcopa_bayes.bench.command import joint, prbs
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.noise import White
-from lcopa_bayes.inference.optimum import along_orders, find_optima
+from lcopa_bayes.inference.optimum import along_orders, find_optima, optima_near
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.shapecoordinates import element_columns
 
 SHORT = record(camera=0.6)
 COUPLED = record(device=TWO, camera=0.5)
@@ -229,6 +232,25 @@ def test_terms_that_cannot_be_exchanged_stay_in_order(priors):
     assert find_optima(posterior, rng, starts=4)
 
 
+@pytest.mark.parametrize(
+    ("noise", "name", "prior"),
+    [
+        ("white", "time_1", ("norm", {"loc": 2.0, "scale": 3.0})),
+        ("white", "sigma", ("norm", {"loc": 0.02, "scale": 0.02})),
+        ("student", "nu", ("norm", {"loc": 8.0, "scale": 8.0})),
+        ("ar1", "rho", ("norm", {"loc": 0.3, "scale": 0.5})),
+        ("white+ar1", "rho", ("halfnorm", {"scale": 0.5})),
+    ],
+)
+def test_a_prior_that_reaches_beyond_its_parameters_domain_is_searched_inside(noise, name, prior):
+    posterior = made(record(), noise=noise, priors={name: prior})
+    ends = [*LeastSquares(posterior).bounds, *Landscape(posterior).search(posterior.table.names.index(name))]
+    assert not np.isnan(np.hstack(ends)).any()
+    assert np.isfinite(Conditional(posterior, delays=True).widths).all()
+    assert np.isfinite(element_columns(posterior)[0].reach).all()
+    assert best(posterior, starts=2)["time_1"] == pytest.approx(TRUTH["time_1"], rel=0.05)
+
+
 def test_noise_is_estimated_from_the_residual():
     noisy = record(camera=0.05, noise_sd=0.05, correlation=0.7, duration=30.0)
     found = best(made(noisy, noise="ar1"), starts=4)
@@ -240,6 +262,20 @@ def test_noise_is_estimated_from_the_residual():
 def test_a_nearly_noise_free_record_keeps_its_small_noise():
     found = best(made(record(camera=0.05, noise_sd=1e-4), blocks=2000), starts=3)
     assert found["sigma"] < 3e-4
+
+
+def test_a_plant_alone_descends_from_near_its_optimum_once(monkeypatch):
+    posterior = made(SHORT)
+    known = find_optima(posterior, np.random.default_rng(0), starts=2)[0]
+    start = known.values.copy()
+    start[posterior.table.names.index("time_1")] *= 1.3
+
+    def searched(*_, **__):
+        raise AssertionError("a second method descends from the same start")
+
+    monkeypatch.setattr(LeastSquares, "search", searched)
+    (found,) = optima_near(posterior, [start])
+    assert found.log_density == pytest.approx(known.log_density, abs=0.1)
 
 
 def test_processes_that_descend_side_by_side_find_the_same_optima():

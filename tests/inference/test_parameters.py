@@ -88,6 +88,11 @@ def test_a_prior_is_normalised_within_its_domain(kind, low, high, prior):
     drawn = row.draw(4000, np.random.default_rng(0))
     start, share = frozen.cdf(low), frozen.cdf(high) - frozen.cdf(low)
     assert stats.kstest(drawn, lambda x: (frozen.cdf(x) - start) / share).pvalue > 1e-3
+    p = np.array([1e-9, 0.1, 0.5, 0.9, 1 - 1e-9])
+    assert_allclose((frozen.cdf(row.quantiles(p)) - start) / share, p, rtol=1e-6, atol=1e-12)
+    ends = row.quantiles((0.0, 1.0))
+    assert low < ends[0] < row.quantiles((0.0, 1e-12))[1]
+    assert ends[1] < high
 
 
 def test_a_correlation_of_one_and_orders_beyond_two_have_no_density():

@@ -19,6 +19,7 @@ from lcopa_bayes.inference import lagsum
 from lcopa_bayes.inference.diffusion import rises
 from lcopa_bayes.inference.lagsearch import LagSearch, likely
 from lcopa_bayes.inference.lagsum import lag_problem
+from lcopa_bayes.sampling import lagdraws
 from lcopa_bayes.sampling.lagdraws import LagDraws, LagMixture, _begun, _walked, _weighted, lag_draws
 
 ENDS = np.array([[0.0, 1.0]])
@@ -56,6 +57,17 @@ def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]
         own = of(draws)
         assert own.mean() == pytest.approx(mean, abs=4 * sd / np.sqrt(ess))
         assert own.std() == pytest.approx(sd, rel=0.25)
+
+
+def test_the_draws_that_are_kept_of_a_walk_are_worth_no_more_than_their_number(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(lagdraws, "_ess", lambda *_: 1e9)
+    monkeypatch.setattr(lagdraws, "_STEPS", 20)
+    search = LagSearch(lag_problem(made()), 0, (0,), np.array([20 * SD]), ENDS, np.array([[0.1, 0.9]]))
+    rng = np.random.default_rng(1)
+    draws, ess = _walked(search, _begun(search, 1, rng), rng)
+    assert ess == pytest.approx(len(draws))
 
 
 @pytest.mark.parametrize("spare", [0, pytest.param(1, marks=pytest.mark.slow)])
