@@ -58,9 +58,9 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     there, beyond it, where errors have twice the p-value.
 
     Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
-    is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation;
-    their geometric mean, at most e times too small whatever their dependence (Vovk and Wang 2020, Biometrika
-    107), is multiplied by the number of axes.
+    is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation
+    (an error beyond all simulated ones by their mean and variance); their geometric mean, at most e times too
+    small whatever their dependence (Vovk and Wang 2020, Biometrika 107), is multiplied by the number of axes.
     """
     if not study.held_out and state.whitening.dependence:
         return None  # the residual was taken for noise, and errors of records left out are little else
@@ -118,9 +118,10 @@ def _missed(
         half = one.half_width[counted]
         seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn + draws, half)
         count += error.size
-    shares = [
-        (1 + np.count_nonzero(each >= one)) / (1 + each.size) for one, each in zip(seen, chance, strict=True)
-    ]
+    reached = chance >= seen[:, None, None]
+    shares = (1 + reached.sum(axis=(1, 2))) / (1 + reached[0].size)
+    if not reached[0].any():  # the number of draws must not decide how improbable it is
+        shares[0] = min(shares[0], _beyond(seen[0], chance[0].mean(), chance[0].var()))
     ratio, coverage = np.sqrt(seen[0] / count) / sd, 1 - seen[1] / count
     return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))), beyond)
 
@@ -128,6 +129,14 @@ def _missed(
 def _error_and_misses(errors: Array, half_width: Vector) -> Array:
     """Squared error [response unit^2], and samples outside the band [-], of errors (..., n), (2, ...)."""
     return np.stack([(errors**2).sum(axis=-1), (np.abs(errors) > half_width).sum(axis=-1)])
+
+
+def _beyond(power: float, mean: Vector | float, variance: Vector | float) -> Vector:
+    """Probability of sums of squares of correlated normal samples above `power`, by their moments [-].
+
+    Each is nearly a multiple of chi-squared with the same mean and variance (Box 1954, Ann. Math. Stat. 25).
+    """
+    return np.asarray(chi2.sf(2 * power * mean / variance, 2 * mean**2 / variance))
 
 
 @final
@@ -192,9 +201,8 @@ class Errors:
     def p_value(self, noise: Sequence[Sequence[Law]]) -> float:
         """Probability of as much power by noise alone, averaged over the processes of each axis [-].
 
-        A sum of squares of correlated normal samples is nearly a multiple of chi-squared with the same mean
-        and variance (Box 1954, Ann. Math. Stat. 25); with squared autocorrelations rho_k^2 its variance is
-        that of ``n / (1 + 2 sum_k (1 - k / n) rho_k^2)`` independent samples.
+        With squared autocorrelations rho_k^2 the variance of a sum of squares is that of
+        ``n / (1 + 2 sum_k (1 - k / n) rho_k^2)`` independent samples.
         """
         mean, variance = np.zeros(len(noise[0])), np.zeros(len(noise[0]))
         for count, sd, axis in zip(self.counts, self.sds, self.axes, strict=True):
@@ -206,8 +214,7 @@ class Errors:
             variance += 2 * count * dependent * size**2
         if not mean.any():
             return 1.0
-        multiple, freedom = variance / (2 * mean), 2 * mean**2 / variance
-        return float(np.mean(chi2.sf(self.power.sum() / multiple, freedom)))
+        return float(_beyond(float(self.power.sum()), mean, variance).mean())
 
 
 def _measured(state: State) -> list[list[Law]]:

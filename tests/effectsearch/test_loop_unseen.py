@@ -100,6 +100,24 @@ def test_errors_that_chance_does_not_reach_are_missed(kind, factor):
     assert away.significant
 
 
+def test_an_error_that_no_draw_reaches_is_the_less_probable_the_larger_it_is():
+    """By a count of draws both would have the same p-value, however many samples lie inside the bands."""
+    study = campaign("white", 3)
+    side, start = fitted(study)
+    (score,), (fit,), (held,) = side.unseen, study.fit, study.held_out
+    study = replace(study, held_out=(replace(held, drive=fit.drive),))
+    few = np.arange(held.time.size) < 10
+    p = []
+    for size in (1.0, 10.0, 20.0):
+        off = replace(score, observed=score.observed + size * SD * few)
+        seen = missed(study, side.fit, [off], start)
+        assert seen.coverage > 0.8
+        p.append(seen.p)
+    assert p[0] > CHANCE
+    assert p[1] < 1e-2 * p[0]
+    assert p[2] < 1e-6 * p[1]
+
+
 def test_errors_beyond_the_fitted_drives_count_by_themselves():
     """Within the range they say as much as if nothing followed; beyond it, where chance does not."""
     study = campaign("white", 5)
