@@ -14,6 +14,8 @@ TIME_UNITS: Mapping[str, int] = MappingProxyType(
     {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 )
 """Nanoseconds in each unit of time by its word."""
+DIMENSIONLESS = ("-", "1")
+"""Units of what has none: that of our own numbers, and what records may say."""
 _COMPOUND = re.compile(r"[/*· ]")
 
 
@@ -25,15 +27,15 @@ def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
 
 
 def per(unit: str, other: str) -> str:
-    """Unit of a ratio, ``-`` where it has none."""
-    if other == "-":
+    """Unit of a ratio, that of the numerator where the denominator has none."""
+    if other in DIMENSIONLESS:
         return unit
     other = (
         f"({other})" if _COMPOUND.search(other) else other
     )  # °C/L/min would be a degree per litre and minute
-    return f"1/{other}" if unit == "-" else f"{unit}/{other}"
+    return f"1/{other}" if unit in DIMENSIONLESS else f"{unit}/{other}"
 
 
 def measured(figure: str, unit: str) -> str:
     """A figure with its unit, alone where it has none."""
-    return figure if unit == "-" else f"{figure} {unit}"
+    return figure if unit in DIMENSIONLESS else f"{figure} {unit}"

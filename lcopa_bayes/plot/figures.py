@@ -64,7 +64,7 @@ def residuals(fit: Result, record: str | None = None, axis: str | None = None) -
 
 @_styled
 def corner(fit: Result, parameters: Sequence[str] = ()) -> Figure:
-    """Marginals and pairs of `parameters`, by default of those that vary, ten at most."""
+    """Marginals and pairs of `parameters`, by default of the first eight that vary, by interest."""
     run = run_of(fit)
     return corner_figure(run, _known(parameters, run.units) or ranked(run.varying)[:IN_CORNER])
 

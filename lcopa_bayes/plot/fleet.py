@@ -57,8 +57,12 @@ def population_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def curves_figure(curves: Sequence[Mapping[str, Any]], time_unit: str) -> Figure:
-    """Response with its 90 % band with noise, and residual below, one column of two panels per device."""
+def curves_figure(curves: Sequence[Mapping[str, Any]]) -> Figure:
+    """Response with its 90 % band with noise, and residual below, one column of two panels per device.
+
+    Where axes or units differ every device has its labels, else the first and the lowest panels.
+    """
+    alike = len({(one["axis"], one["unit"], one["time_unit"]) for one in curves}) == 1
     rows = -(-len(curves) // _COLUMNS)
     figure = blank(0.3 + 2.3 * rows)
     panels = figure.subplots(2 * rows, _COLUMNS, squeeze=False, height_ratios=[2, 1] * rows, sharex=False)
@@ -78,7 +82,8 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], time_unit: str) -> Figure
         above.tick_params(labelbottom=False)
         below.axhline(0.0, color=NOISE, lw=0.6)
         below.plot(time, one["residual"], color=SEEN, lw=0.6)
-        if column == 0:
+        if column == 0 or not alike:
             above.set_ylabel(label(one["axis"], one["unit"]))
-        below.set_xlabel(f"time [{time_unit}]" if k + _COLUMNS >= len(curves) else "")
+        if k + _COLUMNS >= len(curves) or not alike:
+            below.set_xlabel(label("time", one["time_unit"]))
     return figure

@@ -18,6 +18,7 @@ from lcopa_bayes.plot.theme import (
     HELD_OUT,
     INK,
     NOISE,
+    OUTSIDE,
     SEEN,
     blank,
     dots,
@@ -194,10 +195,6 @@ def _responses(panel: Axes, rows: pd.DataFrame, unit: str, colour: str) -> None:
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-_OUTSIDE = "#faf0e8"
-"""Shade of what lies outside the fitted range."""
-
-
 def prediction_figure(rows: pd.DataFrame, drives: pd.DataFrame, time_unit: str) -> Figure:
     """Bands of a response under a drive, shaded where they are outside the fitted range."""
     figure, top, below = above_drives(rows, drives, time_unit, height=3.0, ratio=3.4)
@@ -207,7 +204,7 @@ def prediction_figure(rows: pd.DataFrame, drives: pd.DataFrame, time_unit: str) 
     for panel in (top, *below):
         if beyond.size:
             shade = "outside the fitted range" if panel is top else None
-            panel.axvspan(float(beyond[0]), float(time[-1]), color=_OUTSIDE, lw=0, zorder=-1, label=shade)
+            panel.axvspan(float(beyond[0]), float(time[-1]), color=OUTSIDE, lw=0, zorder=-1, label=shade)
     legend_above(figure, top, 4, markerscale=2)
     return figure
 

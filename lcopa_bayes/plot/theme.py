@@ -30,6 +30,8 @@ HELD_OUT = "#b3410b"
 BAND = "#0072b2"
 NOISE = "#8a8a8a"
 STEADY = "#b3410b"
+OUTSIDE = "#faf0e8"
+"""Shade of what lies outside the fitted range."""
 CYCLE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a6a00", "#000000")
 """Okabe and Ito 2008, distinguishable with any colour vision; yellow darkened."""
 WIDTH = 7.4

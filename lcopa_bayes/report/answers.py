@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import log10
 from typing import Any, NamedTuple, TypeAlias, final
 
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import joined, listed
 from lcopa_bayes.report.formatting import (
     ends,
@@ -53,7 +54,7 @@ def _audit(v: Values) -> _Answers:
     rest = joined(f"{verdict}: {listed(names)}" for verdict, names in others.items())
     yield "What do they leave open?", rest, "Verdicts"
     for best in v["functions"][:1]:
-        known = f"Best is {best['name']}, {ends(best)} {best['unit']} with 90 % probability"
+        known = f"Best is {best['name']}, {measured(ends(best), best['unit'])} with 90 % probability"
         said = f"{known}; the draws behind it are {v['grade']}."
         yield "Which numbers can be trusted?", said, "Best-determined functions"
     limits = [one["reason"] for one in v["limitations"]]
@@ -118,11 +119,12 @@ def _loop(v: Values) -> _Answers:
     held = [(before, after) for before, after in scores if after["held_out"]]
     if held:
         before, after = max(held, key=lambda pair: pair[1]["rmse_over_noise"] or 0.0)
-        change = f"goes from {figures(before['rmse'])} to {figures(after['rmse'])} {after['unit']} rms"
+        error = f"{measured(figures(after['rmse']), after['unit'])} rms"
+        change = f"goes from {figures(before['rmse'])} to {error}" if names else f"errs by {error}"
         if after["rmse_over_noise"] is not None:
             change += f", {figures(after['rmse_over_noise'])} times the noise"
         said = f"The worst held-out response, {after['record']}/{after['axis']}, {change}."
-        yield "How good is it with that?", said, "Errors before and after"
+        yield f"How good is it{' with that' * bool(names)}?", said, "Errors before and after"
     found = [row for one in v["effects"] for row in one["parameters"]]
     yield "Which numbers can be trusted?", _graded(found), "What was missing"
     moved = [f"{row['name']} by {figures(abs(row['shift_in_sd']), 2)} sd" for row in v["moved"]]
@@ -146,6 +148,11 @@ def _design(v: Values) -> _Answers:
         yield "What to measure next?", said, "Recommended drive" if v["template"] else "Drives"
         times = f"{figures(gain['value'], 2)} times ({ends(gain)} over draws)"
         said = f"{gain['parameter']}, the worst, gets {times} more precise than by a step of equal time."
+        if gain["value"] is None:
+            said = f"At most draws a step of equal time leaves open what it determines, {gain['parameter']} "
+            said += "worst."
+        elif gain["value"] == 1:
+            said = f"Nothing: for {gain['parameter']}, the worst, no drive tried is better than a step."
         yield "How much does it gain?", said, "Drives"
     held = [one["confirmed"] for one in v["confirmed"]["trials"]]
     if held:
@@ -187,12 +194,14 @@ def _calibrate(v: Values) -> _Answers:
 
 def _predict(v: Values) -> _Answers:
     for row in v["axes"]:
-        value = to_spread(row["value_at_end"], spread(row))
+        value = measured(to_spread(row["value_at_end"], spread(row)), row["unit"])
         at = f"{row['end']:.4g} {v['time_unit']}"
-        said = f"To {value} {row['unit']} at {at}, {ends(row)} with 90 % probability."
+        said = f"To {value} at {at}, {ends(row)} with 90 % probability."
         yield f"Where does {row['axis']} go?", said, "Predicted response"
-    widths = [(row["axis"], row["half_width_simultaneous"], row["unit"]) for row in v["axes"]]
-    widest = ", ".join(f"{axis} ±{figures(width, 2)} {unit}" for axis, width, unit in widths)
+    widths = [
+        (row["axis"], measured(figures(row["half_width_simultaneous"], 2), row["unit"])) for row in v["axes"]
+    ]
+    widest = ", ".join(f"{axis} ±{width}" for axis, width in widths)
     yield "How sure is that?", f"90 % bands of whole curves are at most {widest}.", "Predicted response"
     yield "Does it match?", _unseen(v["scores"]), "Scores"
     said = f"In {len(v['outside'])} respects it leaves" if v["outside"] else "It stays within"
@@ -257,7 +266,7 @@ def _identify(v: Values) -> _Answers:
         models = sorted(path["models"], key=lambda one: one["output_rmse"])
         best, whole = models[0], next((one for one in models if "integer" in one["method"]), None)
         orders = ", ".join(map(figures, best["orders"]))
-        error = f"{figures(best['output_rmse'])} {path['response_unit']} rms"
+        error = f"{measured(figures(best['output_rmse']), path['response_unit'])} rms"
         delay = f"{figures(best['delay'])} {v['time_unit']}"
         said = f"Orders {orders}, delay {delay} ({best['method']}) leave {error}"
         said += f"; integer orders {figures(whole['output_rmse'])}" if whole not in (None, best) else ""
@@ -267,7 +276,7 @@ def _identify(v: Values) -> _Answers:
     said = "Untested: no record was held out."
     if held:
         one, row = max(held, key=lambda each: each[0]["rmse"])
-        error = f"{one['model']} misses by {figures(one['rmse'])} {row['unit']} rms"
+        error = f"{one['model']} misses by {measured(figures(one['rmse']), row['unit'])} rms"
         said = f"On {row['record']}/{row['axis']}, the worst held out, {error}."
     yield "Does it predict?", said, "Records and models"
     said = (
@@ -317,7 +326,7 @@ def _fleet(v: Values) -> _Answers:
     yield "How did the devices end?", f"{len(devices)} by `{v['of']}`: {ended}.", "Devices"
     rows = [row for group in v["groups"][:1] for row in group["parameters"]]
     each = [
-        f"{' '.join([row['name'], figures(row['mean']['value']), row['unit']]).removesuffix(' -')}, "
+        f"{row['name']} {measured(figures(row['mean']['value']), row['unit'])}, "
         f"spread {figures(row['spread']['value'], 2)}"
         for row in rows
     ]
@@ -360,7 +369,7 @@ def _unseen(scores: Iterable[Values]) -> str:
     if worst is None:
         return ""
     name = "/".join(str(worst[key]) for key in ("record", "axis") if key in worst)
-    share, error = percent(worst["coverage_90"]), f"{figures(worst['rmse'])} {worst['unit']} rms"
+    share, error = percent(worst["coverage_90"]), f"{measured(figures(worst['rmse']), worst['unit'])} rms"
     return (
         f"The worst unseen response, {name}, has {share} of its samples in the 90 % band and errs by {error}."
     )

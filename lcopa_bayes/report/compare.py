@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from lcopa_bayes.comparison.compare import folder_name
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.plot.comparison import candidates_figure, evidence_figure
 from lcopa_bayes.plot.rundata import read_tables
 from lcopa_bayes.report.formatting import figures
@@ -89,7 +90,7 @@ def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held:
     for row in rows:
         for entry in row[key]:
             if (entry["record"], entry["axis"]) == (record, axis):
-                errors.append(f"{row['name']} {figures(entry['rmse'])} {entry['unit']}")
+                errors.append(f"{row['name']} {measured(figures(entry['rmse']), entry['unit'])}")
     bands = f"the {POINTWISE} 90 % band" + (
         "s with noise of all" if held else " with noise of the preferred candidate"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -31,5 +32,12 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
         )
         figure = drive_figure(drive_of(load_columns(folder / values["template"], responses=False)))
         drive = [drawing("design_drive", figure, text, data=values["template"])]
-    ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
+    ranked = sorted(values["table"], key=lambda row: -_factor(row))
     return {"curve": curve, "drive": drive, "ranked": ranked}
+
+
+def _factor(row: Mapping[str, Any]) -> float:
+    """How many times better than the step a drive is; infinite, which JSON cannot hold, where only the step
+    leaves a parameter open."""
+    factor = row["factor_over_step"]
+    return inf if factor is None else float(factor)

@@ -55,13 +55,14 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
         for one in values["groups"]
         if one["parameters"]
     }
-    units = {device: one["time_unit"] for one in values["groups"] for device in one["devices"]}
+    units = {
+        device: one["time_unit"] for one in values["groups"] for device in one["devices"] + one["left_out"]
+    }
     caption = (
         "The worst devices first: measured response (dots) with the 90 % band with noise, and the residual "
         "below, of the record and axis that the model follows worst."
     )
-    curves = values["curves"]
-    unit = units.get(curves[0]["device"], "") if curves else ""
+    curves = [one | {"time_unit": units[one["device"]]} for one in values["curves"]]
     columns = _COLUMNS[values["of"]]
     return {
         "heads": ("device:code", "grade:grade", *(title for title, _, _ in columns), "reason:prose"),
@@ -85,5 +86,5 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
             ),
             key=lambda pair: -float(pair[0]["p_odd"]),
         ),
-        "curves": paged("fleet_worst", curves, _PER_FIGURE, lambda part: curves_figure(part, unit), caption),
+        "curves": paged("fleet_worst", curves, _PER_FIGURE, curves_figure, caption),
     }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.plot.loop import before_after_figure, effects_figure, view_figure
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict
@@ -56,7 +57,7 @@ def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) 
         before, after = (_rmse(results[when], curve) for when in ("before", "after"))
         caption = (
             f"{curve['record']}, {curve['axis']}: root mean square {figures(before)} before and "
-            f"{figures(after)} after, noise {figures(curve['noise_sd'])} {curve['unit']}. "
+            f"{figures(after)} after, noise {measured(figures(curve['noise_sd']), curve['unit'])}. "
             "Grey: 90 % band with noise."
         )
         figure = before_after_figure(curve, results["time_unit"])

@@ -19,6 +19,7 @@ from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, S
 from markupsafe import Markup, escape
 
 from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.report import formatting
 from lcopa_bayes.report.svg import COLOURS, Drawing, inlined
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
@@ -177,6 +178,13 @@ def each(rows: Iterable[Mapping[str, Any]], *keys: str) -> list[tuple[Any, Any]]
     return [(row, one) for row in rows for key in keys for one in row[key]]
 
 
+def noted(rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """What a table shows in place of each `note` of its rows: the number of the note below the table, nothing
+    for a row without one; empty where no row has any."""
+    notes = dict.fromkeys(note for row in rows if (note := row.get("note", "")))
+    return {note: str(number) for number, note in enumerate(notes, start=1)} | ({"": ""} if notes else {})
+
+
 def anchor(title: str) -> str:
     """Name of a section inside its page."""
     return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())
@@ -231,7 +239,13 @@ def write_page(
     }
     environment.globals |= {key: getattr(formatting, key) for key in _CALLED}
     environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
-    environment.globals |= {"each": each, "pairs": zip, "product": product}
+    environment.globals |= {
+        "each": each,
+        "noted": noted,
+        "pairs": zip,
+        "product": product,
+        "measured": measured,
+    }
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
     shown = {"v": values, "drawn": drawn, "overview": overview}
     first = environment.get_template("summary.html").render(shown) if overview else ""

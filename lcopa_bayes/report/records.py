@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Index, Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.plot.records import residual_figure, response_figure
 from lcopa_bayes.plot.rundata import RunData
 from lcopa_bayes.plot.theme import extremes, extremes_note, label
@@ -105,7 +106,7 @@ def _described(score: Mapping[str, Any], record: str, axis: str, size: int, *, h
     parts = [f"Record {record}, axis {axis}, {'held out of the fit' if held else 'fitted'}."]
     if score:
         parts.append(
-            f"RMSE {figures(score['rmse'])} {score['unit']}; {percent(score['coverage_90'])} of the "
+            f"RMSE {measured(figures(score['rmse']), score['unit'])}; {percent(score['coverage_90'])} of the "
             f"{score['samples']} samples lie in the {POINTWISE} 90 % band with noise, "
             f"{percent(score['coverage_50'])} in the 50 % band. Offset: {score['offset_from']}."
         )
@@ -127,7 +128,7 @@ def _tested(run: RunData, record: str, axis: str, size: int, *, held: bool) -> s
         if (test["record"], test["axis"], test["held_out"]) == (record, axis, held):
             p = test["p_white"]
             unit = run.part("residuals", record, axis)["unit"].iloc[0]
-            parts.append(f"Root mean square {figures(test['rms'])} {unit}.")
+            parts.append(f"Root mean square {measured(figures(test['rms']), unit)}.")
             if p is not None:
                 judged = "not white" if p < WHITE_P else "no sign that it is not white"
                 parts.append(f"Ljung-Box test of the whitened residual: {probability(p)}, {judged}.")

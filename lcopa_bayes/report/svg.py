@@ -12,7 +12,7 @@ from zlib import crc32
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from lcopa_bayes.plot.theme import BAND, HELD_OUT, INK, NOISE
+from lcopa_bayes.plot.theme import BAND, HELD_OUT, INK, NOISE, OUTSIDE
 
 T = TypeVar("T")
 _COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
@@ -26,6 +26,8 @@ COLOURS = {
     "#ffffff": ("paper", "#15181c"),
     "#009e73": ("green", "#2fc79a"),
     "#7a6a00": ("olive", "#c9b53a"),
+    "#56b4e9": ("sky", "#2f7dd1"),
+    OUTSIDE: ("outside", "#2f261f"),
 }
 """Colours of figures that a page replaces by a variable: its name and what it is on a dark ground."""
 _LONGEST = 110

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from lcopa_bayes.core.units import TIME_UNITS, in_time_unit, per
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit, measured, per
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 
@@ -58,7 +58,15 @@ def test_a_record_in_minutes_is_the_one_in_seconds(tmp_path):
         ("-", "-", "-"),
         ("°C", "L/min", "°C/(L/min)"),
         ("-", "m3/h", "1/(m3/h)"),
+        ("rad", "1", "rad"),
+        ("1", "V", "1/V"),
+        ("1", "1", "1"),
     ],
 )
 def test_the_unit_of_a_ratio(unit, other, ratio):
     assert per(unit, other) == ratio
+
+
+@pytest.mark.parametrize(("unit", "said"), [("V", "0.2 V"), ("-", "0.2"), ("1", "0.2")])
+def test_a_number_without_a_unit_stands_alone(unit, said):
+    assert measured("0.2", unit) == said

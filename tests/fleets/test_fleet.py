@@ -22,6 +22,8 @@ from lcopa_bayes.fleets.devices import row_of
 from lcopa_bayes.fleets.summary import _shares, results
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.plot.theme import look
+from lcopa_bayes.report import fleet as page_of_fleet
 from lcopa_bayes.results import fit as fits
 from lcopa_bayes.verbs import fleet as verb
 
@@ -302,6 +304,23 @@ def test_devices_of_other_axes_are_groups_and_unusable_draws_are_left_out():
     three = results("three", "fit", members[:3], made)
     assert three["grade"] == "tentative"
     assert "3 devices leave the spread uncertain" in three["grade_reason"]
+
+
+def test_curves_of_the_worst_devices_have_the_units_of_each(tmp_path):
+    """The worst are those that no population takes up, or of another plant."""
+    time = list(map(float, range(4)))
+    curve = dict.fromkeys(("time", "observed", "residual", "lower", "median", "upper"), time)
+    members = [outcome("a"), outcome("b"), outcome("poor", "unusable"), outcome("other", "tentative")]
+    for one in members:
+        one["curve"] = curve | {"axis": "y", "unit": "rad"}
+    members[3]["plant"] |= {"time_unit": "h"}
+    values = results("many", "fit", members, draws(["a", "b", "poor", "other"], np.random.default_rng(2)))
+    assert values["curves"][0]["device"] == "poor"
+    with look():
+        (figure,) = page_of_fleet.drawn(tmp_path, values)["curves"]
+    assert figure.svg.count("time [ms]") == 3
+    assert figure.svg.count("time [h]") == 1
+    assert figure.svg.count("y [rad]") == 4
 
 
 def test_an_odd_device_is_named_with_what_it_differs_in():

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from test_report import run_folder
 
+from lcopa_bayes.plot.theme import CYCLE, OUTSIDE
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.svg import COLOURS
 
@@ -125,6 +126,14 @@ def test_every_text_has_contrast_enough(html, dark):
             if text != "held" or ground == values["paper"]:
                 assert contrast(values[text], ground) >= 4.5, (text, ground)
     assert contrast(values["mark"], "#fff") >= 4.5
+
+
+def test_colours_of_a_cycle_stay_apart_and_seen_on_a_dark_ground():
+    """Each stands for a candidate or an ensemble; what shades a range must not light up."""
+    dark = [COLOURS.get(colour, ("", colour))[1] for colour in CYCLE]
+    assert len(set(dark)) == len(CYCLE)
+    assert all(contrast(colour, "#15181c") >= 3 for colour in dark)
+    assert contrast(COLOURS[OUTSIDE][1], "#15181c") < 1.5
 
 
 def test_explored_values_are_those_of_the_record(html, tmp_path):

@@ -176,6 +176,10 @@ SAID = [
      "Something without a name (firm)."),
     ("loop", (), None, "How good", "The worst held-out response, r/x, goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rad "
      "rms, 1.02 times the noise."),
+    ("loop", (), {"effects": [], "verdict": "clean"}, "How good is it?",
+     "The worst held-out response, r/x, errs by 2.00×10⁻⁴ rad rms, 1.02 times the noise."),
+    ("loop", ("after", "scores", 0, "unit"), "1", "How good is it with that?", "The worst held-out response, r/x, "
+     "goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rms, 1.02 times the noise."),
     ("loop", (), None, "What was wrong", "Biased without it: gain by 15 sd."),
     ("loop", ("moved",), [], "What was wrong", "Without it no parameter was biased."),
     ("loop", ("effects", 0, "group"), ["creep", "drift"], "What stays uncertain?", "creep may as well be drift."),
@@ -186,6 +190,10 @@ SAID = [
     ("design", ("winner",), None, "What to measure", "No drive tried determines any parameter."),
     ("design", (), None, "How much", "time, the worst, gets 4.6 times (1.9 to 14.0 over draws) more precise than by "
      "a step of equal time."),
+    ("design", ("factor_over_step", "value"), None, "How much", "At most draws a step of equal time leaves open what "
+     "it determines, time worst."),
+    ("design", ("factor_over_step", "value"), 1.0, "How much", "Nothing: for time, the worst, no drive tried is "
+     "better than a step."),
     ("design", (), None, "Can that be", "Simulation confirms the gain at 1 of 2 true values; linear bounds hold at "
      "25 % of the draws, which are reliable."),
     ("design", (), None, "What stays open?", "No drive tried brings time to 10 %."),
@@ -196,6 +204,9 @@ SAID = [
      "narrow."),
     ("calibrate", ("grades", "failed"), 0, "Which replicas", "199 reliable."),
     ("predict", (), None, "Where does x go?", "To 0.01750 rad/V at 25 ms, 0.01700 to 0.01800 with 90 % probability."),
+    ("predict", ("axes", 0, "unit"), "1", "Where does x go?", "To 0.01750 at 25 ms, 0.01700 to 0.01800 with 90 % "
+     "probability."),
+    ("predict", ("axes", 0, "unit"), "1", "How sure", "90 % bands of whole curves are at most x ±3.0×10⁻⁴."),
     ("predict", (), None, "Can the drive", "It stays within the range of the fit records; the draws are reliable."),
     ("predict", ("outside",), [1, 2], "Can the drive", "In 2 respects it leaves the range of the fit records; the "
      "draws are reliable."),

@@ -26,8 +26,9 @@ from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.plot.draws import ranked
 from lcopa_bayes.plot.rundata import load_run
 from lcopa_bayes.plot.theme import extremes
-from lcopa_bayes.report import records, write_page, write_report
+from lcopa_bayes.report import design, records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, signed, stopped, to_spread
+from lcopa_bayes.report.page import noted
 from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.report.rules import passages
 from lcopa_bayes.report.svg import Drawing, drawing, inlined
@@ -253,7 +254,8 @@ def test_open_sides_are_said_and_not_printed_as_numbers(html):
         for share in ("2 %", "5 %", "")
     )
     assert first[2] == first[4] == NOT_REACHED
-    assert first[7] == "all draws are late"
+    assert (first[7], second[7], third[7]) == ("1", "", "")
+    assert "<p>Note 1: all draws are late.</p>" in html
     assert second[4] == "7.50 to open"  # the caption says why
     assert third[4] == "0.0380 to 0.0420"
     assert not re.search(r"\b(nan|inf|None)\b", re.sub(r"<svg.*?</svg>", "", html, flags=re.DOTALL))
@@ -571,6 +573,70 @@ def page_with(tmp_path: Path, **more: object) -> str:
 def test_step_table_is_left_out_when_there_are_no_metrics(html, tmp_path):
     assert "<table>" in section_of(html, "step-responses")
     assert "<table>" not in section_of(page_with(tmp_path, step_metrics=[]), "step-responses")
+
+
+def test_notes_that_rows_share_stand_once_below_their_table():
+    rows = [{"note": "b"}, {}, {"note": "a"}, {"note": "b"}, {"note": ""}]
+    assert noted(rows) == {"b": "1", "a": "2", "": ""}
+    assert noted([{}, {"note": ""}]) == {}
+
+
+def test_numbers_of_a_loop_end_at_the_digits_of_their_intervals(tmp_path):
+    """Three digits put a number beside its interval that may lie outside it."""
+    ends = {"lower": 20.00012, "upper": 20.00241, "alone": [20.0, 20.001, 20.002], "sd_noise": 7e-4}
+    row = {"name": "offset", "value": 20.00127, "unit": "degC", "sd": 7e-4, "grade": "tentative"} | ends
+    row |= {"sd_structure": 0.0, "prior_sd": 1.0}
+    late = {
+        "name": "settling_2[y]",
+        "value": None,
+        "upper": None,
+        "sd": None,
+        "note": "100 % of draws are late",
+    }
+    side = {"held_out_coverage_90": 0.9, "log_evidence": 1234567.84, "scores": []}
+    effect = {
+        "name": "creep",
+        "formula": "f",
+        "source": "s",
+        "group": ["creep"],
+        "nearest": [],
+        "constants": [],
+    }
+    values = {
+        **{"sentence": "s.", "cautions": [], "next_measurement": "", "open": [], "alternatives": {}},
+        **{"effects": [effect | {"parameters": [row | {"name": "creep.a"}]}], "parameters": [row]},
+        **{"figures": [row | {"name": "value_at_end[y]"}, row | late], "unseen_by": "held-out records"},
+        **{
+            "before": side,
+            "after": side,
+            "moved": [],
+            "evidence": {"classes": []},
+            "rounds": [],
+            "noise": [],
+        },
+    }
+    drawn = {"curves_left": 0, "residuals": (), "evidence": (), "views": ()}
+    html = write_page(tmp_path, "loop.html", "t", values, drawn).read_text(encoding="utf-8")
+    rows = {one[0]: one for one in rows_of(html) if one}
+    for name in ("creep.a", "offset", "value_at_end[y]"):
+        assert rows[name][1:3] == ["20.00127", "20.00012 to 20.00241"]
+    assert rows["settling_2[y]"][1:3] == ["open", "20.0 to open"]
+    assert (rows["value_at_end[y]"][-1], rows["settling_2[y]"][-1]) == ("", "1")
+    assert "<p>Note 1: 100\u00a0% of draws are late.</p>" in html
+    assert "log evidence 1234567.8 before" in html
+    values["figures"] = values["figures"][:1]
+    plain = write_page(tmp_path, "loop.html", "t", values, drawn).read_text(encoding="utf-8")
+    assert "Note 1" not in plain
+    assert len({one[0]: one for one in rows_of(plain) if one}["value_at_end[y]"]) == 8
+
+
+def test_a_drive_that_determines_what_the_step_leaves_open_comes_first(tmp_path):
+    """Its factor is infinite, which JSON holds as None."""
+    table = [
+        {"drive": name, "factor_over_step": k} for name, k in (("on", 1.0), ("prbs", None), ("ramp", 2.5))
+    ]
+    ranked = design.drawn(tmp_path, {"curve": [{"best": {}}], "template": None, "table": table})["ranked"]
+    assert [row["drive"] for row in ranked] == ["prbs", "ramp", "on"]
 
 
 def test_a_clause_becomes_a_sentence_once():
