@@ -40,12 +40,23 @@ class CellTable:
     rows: Sequence[int]
     columns: list[Texts]
     problems: list[str]
+    sheet: str = ""
+    """Where a workbook has several."""
+
+    @property
+    def where(self) -> str:
+        """The file, and the sheet of it."""
+        return f"{self.path}, sheet {self.sheet!r}" if self.sheet else f"{self.path}"
+
+    @property
+    def counted(self) -> str:
+        """What `rows` are numbers of."""
+        return "line" if self.path.suffix.lower() in TEXTS else "row"
 
     def place(self, column: int, row: int | None = None) -> str:
         """Place of a column or of one of its cells in the user's file."""
-        count = "line" if self.path.suffix.lower() in TEXTS else "row"
-        middle = "" if row is None else f", {count} {self.rows[row]}"
-        return f"{self.path}{middle}, column {self.names[column]!r}"
+        middle = "" if row is None else f", {self.counted} {self.rows[row]}"
+        return f"{self.where}{middle}, column {self.names[column]!r}"
 
     def add(self, problems: Sequence[str], place: str) -> None:
         """Add the first problems of a kind and the number of the others."""

@@ -18,7 +18,8 @@ from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.units import TIME_UNITS
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.data.spreadsheet import decimal_sign, numbers, seconds
+from lcopa_bayes.data.spreadsheet import decimal_sign, numbers
+from lcopa_bayes.data.timestamps import seconds
 
 _TIME = re.compile(
     r"(?<![a-z])(time|times|timestamp|date|datetime|datum|zeit|uhrzeit|elapsed|clock|temps|tiempo|tempo|t)(?![a-z\d])"
@@ -47,6 +48,8 @@ _LEVELS = 5
 """Levels that make a rarely changing column a drive whatever its jumps [-]."""
 _QUANTA = 2.0
 """Median jump over the smallest above which jumps are no quanta of a sensor [-]."""
+_MIDNIGHT = " 00:00:00"
+"""What workbooks and data bases add to a date without a time of day."""
 UNKNOWN = "-"
 """Unit of a column whose header names none."""
 
@@ -116,6 +119,7 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
             f"{tables[0].path} and {tables[-1].path} have no header in common; convert them one by one"
         )
     problems: list[str] = []
+    notes += [f"{t.path.name}: sheet {t.sheet!r} is read; --sheet names another." for t in tables if t.sheet]
     signs = [decimal_sign(table, problems, mapped.decimal) for table in tables]
     refuse_if(problems)
     columns = {
@@ -136,7 +140,7 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
         late = np.flatnonzero(np.diff(times[k]) <= 0).tolist()
         rule = "the time does not come after that of the row before; sort the rows, and keep one of two alike"
         at = table.names.index(time[0])
-        table.add([f"{table.place(at, row + 1)}: {rule}" for row in late], str(table.path))
+        table.add([f"{table.place(at, row + 1)}: {rule}" for row in late], table.where)
         for axis_name, name in (*drives.items(), *responses.items()):
             _unreadable(table, name, columns[name].values[k], axis_name.name)
         problems += table.problems
@@ -145,7 +149,9 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
         held = [_held(columns[name].values[k]) for name in drives.values()]
         first = [name for name, one in zip(drives.values(), held, strict=True) if np.isnan(one[0])]
         if first:
-            problems.append(f"{table.path}: the first row has no value of the drive {first[0]!r}; fill it in")
+            problems.append(
+                f"{table.where}: the first row has no value of the drive {first[0]!r}; fill it in"
+            )
             continue
         if any(np.isnan(columns[name].values[k]).any() for name in drives.values()):
             notes.append(f"{table.path.name}: an empty cell of a drive holds the value above it.")
@@ -196,7 +202,7 @@ def _time(
     """Headers of the time, times of every table and their unit."""
     names = _time_columns(tables, columns, mapped)
     column = columns[names[0]]
-    if len(names) == 1 and column.numeric:
+    if len(names) == 1 and column.numeric and not mapped.time_format:
         for table, values in zip(tables, column.values, strict=True):
             _unreadable(table, names[0], values, "time", empty=True)
         unit = _UNIT_OF_TIME.get(column.axis.unit.lower(), mapped.time_unit)
@@ -205,7 +211,7 @@ def _time(
         if unit not in TIME_UNITS:
             given = unit or (column.axis.unit if column.axis.unit != UNKNOWN else "")
             raise InputError(
-                f"{tables[0].path}: the time column {names[0]!r} "
+                f"{tables[0].where}: the time column {names[0]!r} "
                 + (f"is in {given!r}, which is not known" if given else "has no unit")
                 + f"; state it with --time-unit, one of {', '.join(TIME_UNITS)}"
             )
@@ -214,7 +220,7 @@ def _time(
     times = []
     for table in tables:
         cells, *more = (table.columns[table.names.index(name)] for name in names)
-        joined = [" ".join(both) for both in zip(cells, *more, strict=True)] if more else cells
+        joined = [" ".join(both) for both in zip(map(_day, cells), *more, strict=True)] if more else cells
         times.append(seconds(table, names[0], joined, mapped.time_format))
     said = " and ".join(repr(name) for name in names)
     notes.append(f"The time is that of {said}, counted in s from the first row of each table.")
@@ -224,7 +230,7 @@ def _time(
 def _time_columns(
     tables: Sequence[CellTable], columns: Mapping[str, _Column], mapped: Mapped
 ) -> tuple[str, ...]:
-    where = tables[0].path
+    where = tables[0].where
     if mapped.time:
         name = resolved(mapped.time, list(columns))
         if name is None:
@@ -237,7 +243,7 @@ def _time_columns(
         matches = (bool(re.fullmatch(pattern, cell, re.IGNORECASE)) for cell in cells)
         return next(matches, False) and all(matches)
 
-    dates = [name for name in texts if stamped(name, r"\d+[./-]\d+[./-]\d+")]
+    dates = [name for name in texts if stamped(name, rf"\d+[./-]\d+[./-]\d+({_MIDNIGHT})?")]
     clocks = [name for name in texts if stamped(name, r"\d+:\d+(:\d+([.,]\d+)?)?(\s*[ap]m)?")]
     if len(dates) == len(clocks) == 1:
         return dates[0], clocks[0]
@@ -257,6 +263,10 @@ def _time_columns(
             + ", ".join(repr(name) for name in columns)
         )
     return (both[0],)
+
+
+def _day(cell: str) -> str:
+    return cell.removesuffix(_MIDNIGHT)
 
 
 def _called_time(axis: Axis) -> bool:
@@ -293,13 +303,18 @@ def _roles(
                 roles[role][column.axis] = name
                 notes.append(f"{name!r} is a {role}, in {column.axis.unit} ({why}).")
     lacking = [role for role, each in roles.items() if not each]
+    usable = [name for name, column in columns.items() if column.numeric and column.moves]
+    free = [name for name in usable if name not in taken]
+    remedy = "name one with --{}, one of " + ", ".join(map(repr, free))
+    if len(usable) < 2 or not free:
+        known = f"only {usable[0]!r} holds" if len(usable) == 1 else "no other column holds"
+        remedy = (
+            f"besides the time {known} numbers that change; a record needs a drive that changes, and its "
+            "response"
+        )
     refuse_if(
         problems
-        + [
-            f"{table.path}: no column is recognised as a {role}; name one with --{role}, one of "
-            + ", ".join(repr(name) for name in columns if name not in taken)
-            for role in lacking
-        ]
+        + [f"{table.where}: no column is recognised as a {role}; {remedy.format(role)}" for role in lacking]
     )
     return roles["drive"], roles["response"]
 
@@ -321,12 +336,12 @@ def _stated(
         wanted, equals, column = one.rpartition("=")
         name = resolved(column, list(columns))
         if name is None:
-            problems.append(f"{table.path}: has no column {column!r}{nearest(column, columns)}")
+            problems.append(f"{table.where}: has no column {column!r}{nearest(column, columns)}")
             continue
         axis = axis_of(wanted) if equals else columns[name].axis
         unit = axis.unit if axis.unit != UNKNOWN else columns[name].axis.unit
         if not columns[name].numeric:
-            problems.append(f"{table.path}: the column {name!r} holds no numbers")
+            problems.append(f"{table.where}: the column {name!r} holds no numbers")
         if not _taken(table, role, axis, name, out, problems):
             out[Axis(axis.name, unit)] = name
     return out
@@ -339,7 +354,7 @@ def _taken(
     other = next((header for known, header in own.items() if known.name == axis.name), "")
     if other:
         problems.append(
-            f"{table.path}: the columns {other!r} and {name!r} would both be the {role} {axis.name!r}; give "
+            f"{table.where}: the columns {other!r} and {name!r} would both be the {role} {axis.name!r}; give "
             f"one another name, such as --{role} {other!r} '{axis.name}_2={name}', or state one alone"
         )
     return bool(other)

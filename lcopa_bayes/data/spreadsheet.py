@@ -3,7 +3,7 @@
 Everything is read as text first, with its line or row, so that a message can quote it. Above the
 header there may be lines of remarks, below it a line of units.
 
-Numbers and time stamps in the notations of spreadsheets.
+Numbers in the notations of spreadsheets.
 """
 
 from __future__ import annotations
@@ -12,18 +12,16 @@ import csv
 import datetime
 import io
 import re
-import warnings
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from itertools import chain, count, islice, product, zip_longest
+from itertools import chain, count, islice, zip_longest
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
-import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
@@ -43,6 +41,8 @@ _SHORT = 4
 """Longest unit without brackets."""
 _WRITTEN_FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
 """A formula in a part of a workbook."""
+_FEWEST = 3
+"""Columns of a table, fewest: time, drive and response."""
 _NAMED = 5
 """Most cells that a message names."""
 _HEADED = 40
@@ -52,7 +52,8 @@ _HEADED = 40
 def read_spreadsheet(path: Path, *, sheet: str | None = None) -> CellTable:
     """The cells of a table as text under their headers, units in brackets behind them.
 
-    `sheet` names the sheet of a workbook, by default its only one or the first with a table. InputError when
+    `sheet` names the sheet of a workbook, by default the first with a table of three columns or more, else of
+    two. InputError when
     there is no such file or sheet, it cannot be read, or it holds no table.
     """
     path = Path(path)
@@ -116,19 +117,20 @@ def _workbook(path: Path, sheet: str | None) -> CellTable:
     with closing(_book(path, data_only=True)) as book:
         if sheet is not None and sheet not in book.sheetnames:
             raise InputError(f"{path}: has no sheet {sheet!r}{nearest(sheet, book.sheetnames)}")
-        formulas = _has_formulas(path)
-        for name in [sheet] if sheet is not None else book.sheetnames:
-            if not hasattr(book[name], "iter_rows"):
-                continue  # a chart
-            if formulas:
+        heads = {
+            name: list(islice(_texts(path, book[name]), _HEADED + 1))
+            for name in ([sheet] if sheet is not None else book.sheetnames)
+            if hasattr(book[name], "iter_rows")  # a chart has none
+        }
+        tables = [name for name, head in heads.items() if max((_filled(c) for _, c in head), default=0) > 1]
+        named = (name for name in tables if _named(heads[name]) >= _FEWEST)
+        name = next(named, next(iter(tables), None))
+        if name is not None:
+            if _has_formulas(path):
                 refuse_if(list(islice(_open_formulas(path, name), _NAMED)))
-            texts = ((n, [_cell(cell.value) for cell in cells]) for n, cells in _rows(path, book[name]))
-            rows = ((number, cells) for number, cells in texts if any(cells))
-            head = list(islice(rows, _HEADED + 1))
-            if max((_filled(cells) for _, cells in head), default=0) > 1:
-                width = max(len(cells) for _, cells in head)  # a column may have no name
-                whole = ((n, [*cells, *[""] * (width - len(cells))]) for n, cells in chain(head, rows))
-                return _tabled(path, whole)
+            width = max(len(cells) for _, cells in heads[name])  # a column may have no name
+            whole = ((n, [*cells, *[""] * (width - len(cells))]) for n, cells in _texts(path, book[name]))
+            return _tabled(path, whole, sheet=name if len(book.sheetnames) > 1 else "")
         where = f"{path}, sheet {sheet!r}" if sheet is not None else f"{path}"
         others = ", ".join(repr(name) for name in book.sheetnames if name != sheet)
     more = f"; the other sheets are {others}" if sheet is not None and others else ""
@@ -141,6 +143,12 @@ def _book(path: Path, *, data_only: bool) -> Any:
 
     with _sound(path):
         return load_workbook(path, data_only=data_only, read_only=True)
+
+
+def _texts(path: Path, page: Any) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and texts of the rows of a sheet that are not empty."""
+    texts = ((number, [_cell(cell.value) for cell in cells]) for number, cells in _rows(path, page))
+    return ((number, cells) for number, cells in texts if any(cells))
 
 
 def _rows(path: Path, page: Any) -> Iterator[tuple[int, Sequence[Any]]]:
@@ -191,23 +199,26 @@ def _cell(value: object) -> str:
     if isinstance(value, datetime.datetime | datetime.time):
         return value.isoformat(sep=" ") if isinstance(value, datetime.datetime) else value.isoformat()
     if isinstance(value, datetime.timedelta):
-        return repr(value.total_seconds())
+        whole, part = divmod(value.total_seconds(), 60.0)
+        return f"{int(whole // 60)}:{int(whole % 60):02}:{part:09.6f}"  # hours may be more than 24
     return str(value).strip()
 
 
-def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
+def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]], *, sheet: str = "") -> CellTable:
     """Rows of cells below their header; what is wrong joins the problems of the table."""
     rest = iter(rows)
     head = list(islice(rest, _HEADED + 1))
-    first = next((k for k, (_, cells) in enumerate(head) if len(cells) > 1 and _holds_data(cells)), None)
+    table = CellTable(path, [], [], [], [], sheet)
+    first = _first(head)
     if not first:
         what = "has no header" if first == 0 else "has no rows of numbers"
-        raise InputError(f"{path}: {what}; expected a line of column names above the rows of numbers")
+        raise InputError(f"{table.where}: {what}; expected a line of column names above the rows of numbers")
     above = [cells for _, cells in head[:first]]
-    units = _units(above[-1]) if len(above) > 1 and _filled(above[-2]) > 1 else None
+    units = _units(above[-1]) if len(above) > 1 and _names(*above[-2:]) else None
     header = [name[:_LONGEST] for name in (above[-2] if units else above[-1])]
+    at = f"{table.where}, {table.counted} {head[first][0]}"
     if _filled(header) < 2:
-        raise InputError(f"{path}, line {head[first][0]}: there is no line of column names above the numbers")
+        raise InputError(f"{at}: there is no line of column names above the numbers")
     names = [
         f"{name} [{unit[:_LONGEST]}]" if units and unit else name
         for name, unit in zip_longest(header, (units or [])[: len(header)], fillvalue="")
@@ -218,8 +229,9 @@ def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
         for number, cells in chain(head[first:], rest):
             if _filled(cells) > len(header):
                 ragged.append(
-                    f"{path}, line {number}: has {len(cells)} cells where the header has {len(header)}; if "
-                    "decimals are written with commas, save the table with semicolons between its columns"
+                    f"{table.where}, {table.counted} {number}: has {len(cells)} cells where the header has "
+                    f"{len(header)}; if decimals are written with commas, save the table with semicolons "
+                    "between its columns"
                 )
                 continue
             lines.append(number)
@@ -229,11 +241,44 @@ def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
     used = [k for k, name in enumerate(names) if name or any(columns[k])]
     names = _distinct([names[k] or f"column {k + 1}" for k in used])
     if ragged and not lines:  # the same fault throughout
-        ragged = [f"{ragged[0].replace(f', line {head[first][0]}', '')} (so in all {len(ragged)} rows)"]
-    table = CellTable(path, names, lines, [columns[k] for k in used], [])
-    table.add(ragged, str(path))
+        ragged = [f"{ragged[0].replace(at, table.where)} (so in all {len(ragged)} rows)"]
+    table = CellTable(path, names, lines, [columns[k] for k in used], [], sheet)
+    table.add(ragged, table.where)
     refuse_if(table.problems)
     return table
+
+
+def _first(head: Sequence[tuple[int, list[str]]]) -> int | None:
+    """Position of the first row of data in the head of a table, the one below its header; None without any.
+
+    Remarks above a header may look like data: a date, or a name and a number. A header is the widest line
+    above data, and wider than all such remarks.
+    """
+    data = [len(cells) > 1 and _holds_data(cells) for _, cells in head]
+    widths = [_reach(cells) for _, cells in head]
+    starts = [k for k, is_so in enumerate(data) if is_so and not (k and data[k - 1])]
+
+    def named(k: int) -> int:
+        return max((widths[j] for j in range(max(0, k - 2), k) if not data[j]), default=0)
+
+    below = [k for k in starts[1:] if all(widths[j] < named(k) for j in range(k) if data[j])]
+    return max([*starts[:1], *below], key=named, default=None)
+
+
+def _named(head: Sequence[tuple[int, list[str]]]) -> int:
+    """Columns that the line above the first row of data names."""
+    first = _first(head)
+    return max((_filled(cells) for _, cells in head[max(0, first - 2) : first]), default=0) if first else 0
+
+
+def _names(names: Sequence[str], units: Sequence[str]) -> bool:
+    """Whether a line names as many columns as one below it that may hold their units."""
+    return _filled(names) > 1 and _reach(names) >= _reach(units)
+
+
+def _reach(cells: Sequence[str]) -> int:
+    """Number of cells up to the last filled one."""
+    return max((k for k, cell in enumerate(cells, start=1) if cell), default=0)
 
 
 def _holds_data(cells: Iterable[str]) -> bool:
@@ -276,10 +321,6 @@ _WRITTEN = {
 }
 """Numbers by their decimal sign: the other one stands between groups of digits alone."""
 _SPACES = re.compile(r"[\s\u00a0\u202f']")
-_DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
-_CLOCKS = ("%H:%M:%S.%f", "%H:%M", "%I:%M:%S.%f %p", "%I:%M %p")
-_FORMATS = (*(f"{date} {clock}" for date, clock in product(_DATES, _CLOCKS)), *_CLOCKS, *_DATES)
-_DAY = 86_400.0
 
 
 def decimal_sign(table: CellTable, problems: list[str], stated: str = "") -> str:
@@ -303,7 +344,7 @@ def decimal_sign(table: CellTable, problems: list[str], stated: str = "") -> str
         first = first or cell
     if first:
         problems.append(
-            f"{table.path}: {first!r} may be a number of thousands or have a decimal comma; state the "
+            f"{table.where}: {first!r} may be a number of thousands or have a decimal comma; state the "
             "decimal sign with --decimal"
         )
     return "."
@@ -324,57 +365,3 @@ def _number(cell: str, sign: str) -> float:
     except ValueError:
         return np.nan
     return value if np.isfinite(value) else np.nan
-
-
-def seconds(table: CellTable, column: str, cells: Texts, stated: str = "") -> Vector:
-    """Time stamps as seconds since the first one, (n,).
-
-    Times of day without a date go on over midnight. InputError where stamps have several formats, none that
-    is known, or may have the month or the day first.
-    """
-    text = pd.Series([_stamp(cell) for cell in cells])
-    forms = (stated,) if stated else _FORMATS
-    readable = [form for form in forms if _parsed(text[:1], form).notna().all()]
-    elapsed = [_elapsed(times, form) for form in readable if (times := _parsed(text, form)).notna().all()]
-    if not elapsed:
-        at, share = table.names.index(column), {form: _parsed(text, form).notna().mean() for form in forms}
-        best = max(share, key=share.__getitem__)
-        bad = np.flatnonzero(_parsed(text, best).isna())
-        known = f"the format {best} of the others" if share[best] > 0 else "a known format"
-        problems = [
-            f"{table.place(at, int(row))}: {cells[row]!r} is not a time in {known}; write all times alike, "
-            "or state their format with --time-format, such as %d.%m.%Y %H:%M:%S"
-            for row in bad[:5]
-        ]
-        raise InputError(problems)
-    rising = [one for one in elapsed if (np.diff(one) > 0).all()] or elapsed[:1]
-    refuse_if(
-        [
-            f"{table.path}: the dates of {column!r} may have the day or the month first; state their format "
-            "with --time-format, such as %d/%m/%Y %H:%M:%S"
-        ]
-        if any(not np.allclose(rising[0], other) for other in rising[1:])
-        else []
-    )
-    return rising[0]
-
-
-def _stamp(cell: str) -> str:
-    """With a space between date and time, a point before fractions, which all times to the second have."""
-    text = re.sub(r"(?<=\d)T(?=\d)", " ", cell.strip()).removesuffix("Z")
-    text = re.sub(r"(:\d\d:\d\d),(\d)", r"\1.\2", text)
-    text = re.sub(r"(\d)\s*([AaPp][Mm])$", r"\1 \2", text)
-    return re.sub(r"(:\d\d:\d\d)(?![.\d])", r"\1.0", text)
-
-
-def _parsed(text: pd.Series[str], form: str) -> pd.Series[pd.Timestamp]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return pd.to_datetime(text, format=form, errors="coerce")
-
-
-def _elapsed(times: pd.Series[pd.Timestamp], form: str) -> Vector:
-    elapsed = (times - times.iloc[0]).dt.total_seconds().to_numpy(dtype=float)
-    if "%d" not in form:  # over midnight
-        elapsed = elapsed + _DAY * np.concatenate(([0.0], np.cumsum(np.diff(elapsed) < -0.5 * _DAY)))
-    return np.asarray(elapsed)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -13,7 +14,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.errors import gathered, refuse_if
+from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.agreement import Disagreement, disagreements
@@ -73,6 +74,8 @@ class Study:
     """Models to compare besides those any study has."""
     effects: EffectsSettings
     """Effects of the plant beyond its linear elements."""
+    file: Path | None
+    """The study file, which messages name; None when the study was made otherwise."""
 
     def __init__(
         self,
@@ -91,6 +94,7 @@ class Study:
         compare: CompareSettings | Mapping[str, object] | None = None,
         candidates: Sequence[CandidateSettings | Mapping[str, object]] | None = None,
         effects: EffectsSettings | Mapping[str, object] | None = None,
+        file: Path | None = None,
         *,
         terms: int | Mapping[str, int] | None = None,
     ) -> None:
@@ -135,12 +139,24 @@ class Study:
             "fit": tuple(_in_order(r, fitted[0]) for r in fitted),
             "held_out": tuple(_in_order(r, fitted[0]) for r in apart),
             "inputs": inputs or {},
+            "file": file,
         }
         plant = len(fitted[0].drive_axes), len(fitted[0].response_axes)
         settings["model"] = settings["model"].for_plant(*plant)
         for key, value in settings.items():
             locked = MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
             object.__setattr__(self, key, locked)
+
+    @contextmanager
+    def located(self) -> Iterator[None]:
+        """Within it, what is said to be wrong with a table of the study names its file."""
+        try:
+            yield
+        except InputError as error:
+            if self.file is None:
+                raise
+            said = [f"{self.file}, {one}" if one.startswith("[") else one for one in error.problems]
+            raise InputError(said) from None
 
     @property
     def exposure(self) -> float:

@@ -125,6 +125,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         tuple(records["fit"]),
         tuple(records["held_out"]),
         inputs=_hashes([*used, *fit, *apart]),
+        file=path,
         **settings | ({} if settings["stages"] else {"stages": None}),
     )
     if problems:

@@ -108,6 +108,11 @@ class Problem:
 
 def problem_of(study: Study) -> Problem:
     """Posterior of a study; InputError when model, effects, priors and records do not fit together."""
+    with study.located():
+        return _assembled(study)
+
+
+def _assembled(study: Study) -> Problem:
     keep_freed_memory()  # what follows evaluates many responses, wherever it is called from
     layout = Layout.of(study.drive_axes, study.response_axes, study.model)
     scales = Scales.of(study.fit)
@@ -132,6 +137,13 @@ def table_of(
     study: Study, layout: Layout, scales: Scales
 ) -> tuple[tuple[type[Effect], ...], Ranges | None, ParameterTable]:
     """Effects of a study, their scales, and its parameter table; InputError with all that is wrong."""
+    with study.located():
+        return _tabled(study, layout, scales)
+
+
+def _tabled(
+    study: Study, layout: Layout, scales: Scales
+) -> tuple[tuple[type[Effect], ...], Ranges | None, ParameterTable]:
     kinds, problems = used_kinds(study, layout)
     ranges = record_ranges(study, layout, scales) if kinds and not problems else None
     records = [record.name for record in study.fit]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, final
 
-from lcopa_bayes.core.errors import nearest, refuse_if
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.units import per
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
@@ -160,6 +160,11 @@ def _terms(names: tuple[str, ...], model: ModelSettings) -> list[int]:
     """Number of viscous terms of each element."""
     if not isinstance(model.terms, Mapping):
         return [model.most_terms] * len(names)
+    if names == ("",) and (unknown := [key for key in model.terms if key]):
+        raise InputError(
+            f"[model] terms names {', '.join(map(repr, unknown))}, but this plant has one element, that of "
+            "all its paths; give its number of terms alone, as in `terms = 2`"
+        )
     problems = [
         f"[model] terms names the element {key!r}, which this plant does not have{nearest(key, names)}"
         for key in model.terms

@@ -124,6 +124,53 @@ def test_a_workbook_is_read_from_the_sheet_that_holds_a_table(tmp_path):
         read_spreadsheet(path, sheet="dat")
 
 
+REMARKS = [
+    "Oven test;\n2026-05-01 12:00;\n",
+    "Operator;J. Doe\nDate;01.05.2026\nChannels;2\n\n",
+    "Interval;0.5\n",
+    "Operator;J. Doe\nSerial;17\n",
+]
+
+
+@pytest.mark.parametrize("remarks", REMARKS)
+@pytest.mark.parametrize("header", ["Time [s];Heater [%];T1", "t [s];u;y"])
+def test_remarks_above_a_header_may_look_like_data(remarks, header, tmp_path):
+    table(tmp_path / "x.csv", tuple(header.split(";")), separator=";", above=remarks)
+    assert read_spreadsheet(tmp_path / "x.csv").names == header.split(";")
+    assert_array_equal(read(tmp_path / "x.csv").time, TIME)
+
+
+def test_a_line_of_text_within_the_data_is_no_header(tmp_path):
+    (tmp_path / "x.csv").write_text("Time [s],u,y\n0,0,1\nstop,stop,stop\n2,1,4\n3,1,5")
+    with pytest.raises(InputError, match="line 3, column 'Time \\[s\\]': 'stop' is not a number of time"):
+        read(tmp_path / "x.csv")
+    (tmp_path / "y.csv").write_text("0,0,1\nstop,stop,stop\n2,1,4\n3,1,5")
+    with pytest.raises(InputError, match="has no header"):
+        read(tmp_path / "y.csv")
+
+
+def test_the_sheet_that_is_read_is_named_and_remarks_are_no_table(tmp_path):
+    book = Workbook()
+    book.active.append(["Operator", "J. Doe"])
+    book.active.append(["Rate", 2])
+    for name, cell in (("run 1", 5.0), ("run 2", "oops")):
+        page = book.create_sheet(name)
+        page.append(["t [s]", "u", "y"])
+        for row in ([0, 0, 1], [1, 1, 2], [2, 1, cell]):
+            page.append(row)
+    book.save(tmp_path / "x.xlsx")
+    _, notes = convert([read_spreadsheet(tmp_path / "x.xlsx")], Mapped())
+    assert notes[0] == "x.xlsx: sheet 'run 1' is read; --sheet names another."
+    with pytest.raises(InputError, match=r"x.xlsx, sheet 'run 2', row 4, column 'y': 'oops' is not a number"):
+        convert([read_spreadsheet(tmp_path / "x.xlsx", sheet="run 2")], Mapped())
+
+
+def test_a_table_without_a_drive_is_not_told_to_name_its_response(tmp_path):
+    (tmp_path / "x.csv").write_text("Time [s],u,y\n0,1,1\n1,1,2\n2,1,4\n3,1,5")
+    with pytest.raises(InputError, match="only 'y' holds numbers that change; a record needs a drive that"):
+        read(tmp_path / "x.csv")
+
+
 def test_a_formula_without_a_stored_result_is_named_by_its_cell(tmp_path):
     book = Workbook()
     book.active.append(["t [s]", "u", "y"])

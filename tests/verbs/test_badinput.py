@@ -256,6 +256,23 @@ def test_a_plant_that_cannot_be_read_is_not_judged_further(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[model]\nterms = { dircet = 2 }", "[model] terms names 'dircet', but this plant has one element"),
+        ("[priors]\ngian = 3", "[priors] gian: this model has no such parameter; did you mean 'gain'"),
+        ("[model]\nterms = 1\n[priors]\norder_1 = 3", "[priors] order_1 = 3: must lie in (0, 2]"),
+    ],
+)
+def test_what_does_not_fit_the_plant_names_the_study_file(text, said, tmp_path, capsys):
+    file = tmp_path / "study.toml"
+    save_record(record(camera=0.6), tmp_path / "step.csv")
+    file.write_text(text)
+    assert main(["check", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {file}, {said}")
+
+
+@pytest.mark.parametrize(
     ("option", "least"), [("--jobs=0", 1), ("--jobs=-2", 1), ("--seed=-1", 0), ("--seed=1.5", 0)]
 )
 def test_numbers_of_the_command_line_that_cannot_be_used_are_named(option, least, tmp_path, capsys):
