@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
@@ -47,7 +47,16 @@ class Limits:
     @property
     def far(self) -> Vector:
         """The end of each range that is farther from rest [drive unit], where a plain step goes."""
-        return np.where(self.high - self.rest >= self.rest - self.low, self.high, self.low)
+        return np.where(self._upwards, self.high, self.low)
+
+    @property
+    def near(self) -> Vector:
+        """The other end [drive unit]."""
+        return np.where(self._upwards, self.low, self.high)
+
+    @property
+    def _upwards(self) -> Flags:
+        return np.asarray(self.high - self.rest >= self.rest - self.low)
 
 
 def limits_of(problem: Problem, *, amplitude: float | None = None, refresh: float | None = None) -> Limits:
@@ -129,8 +138,9 @@ class Candidate:
     command: Command
 
 
-Shape = Callable[[int, np.random.Generator], Vector]
-"""Position from the near end (0) to the far end (1) of a range, on so many refreshes, [-]."""
+Shape = Callable[[int, float, np.random.Generator], Vector]
+"""Position on so many refreshes, from the near end (0) to the far end (1) of a range in which the drive rests
+at a given position [-]."""
 
 
 def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: str) -> tuple[Candidate, ...]:
@@ -142,13 +152,14 @@ def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: s
     """
     ticks, axes = max(2, round(time / limits.refresh)), limits.rest.size
     drives: list[Candidate] = []
+    resting = _resting(limits)
     for name, family, words, shape in _shapes(ticks, limits.refresh, unit):
-        shares = _stacked(name, shape, ticks, axes, rng)
+        shares = _stacked(name, shape, ticks, resting, rng)
         drives.append(Candidate(name, family, words, _command(limits, shares)))
     for axis in range(axes if axes > 1 else 0):
         for name, shape in ((PLAIN, _step), ("binary, every refresh", _binary(1))):
-            alone = np.zeros((ticks, axes))
-            alone[:, axis] = shape(ticks, rng)
+            alone = np.tile(resting, (ticks, 1))
+            alone[:, axis] = shape(ticks, resting[axis], rng)
             drives.append(
                 Candidate(
                     f"{name}, axis {axis + 1} alone",
@@ -160,21 +171,25 @@ def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: s
     return tuple(drives)
 
 
-def _stacked(name: str, shape: Shape, ticks: int, axes: int, rng: np.random.Generator) -> Matrix:
-    """Shares of all axes, (ticks, axes)."""
-    out = np.zeros((ticks, axes))
+def _resting(limits: Limits) -> Vector:
+    """Position of rest in each range, (axes,) [-]."""
+    return np.asarray((limits.rest - limits.near) / (limits.far - limits.near))
+
+
+def _stacked(name: str, shape: Shape, ticks: int, resting: Vector, rng: np.random.Generator) -> Matrix:
+    """Positions of all axes, (ticks, axes)."""
+    axes = resting.size
+    out = np.tile(resting, (ticks, 1))
     for axis in range(axes):
         begin = axis * ticks // axes if name == PLAIN else axis * ticks // (3 * axes)
-        out[begin:, axis] = shape(ticks - begin, rng)
+        out[begin:, axis] = shape(ticks - begin, resting[axis], rng)
     return out
 
 
 def _command(limits: Limits, shares: Matrix) -> Command:
-    """Shares of each range as a command; only refreshes at which some axis changes are kept."""
-    far = limits.far
-    near = np.where(far == limits.high, limits.low, limits.high)
-    levels = near + shares * (far - near)
-    levels = np.where(shares == 0.0, limits.rest, levels)
+    """Positions in each range as a command; only refreshes at which some axis changes are kept."""
+    levels = limits.near + shares * (limits.far - limits.near)
+    levels = np.where(shares == _resting(limits), limits.rest, levels)  # to the last bit
     moved = (np.diff(levels, axis=0, prepend=limits.rest[None]) != 0).any(axis=1)
     times = np.round(limits.refresh * np.arange(shares.shape[0]), 9)
     return Command(times[moved], levels[moved], limits.rest)
@@ -184,12 +199,12 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
     """Name, family, words and shape of every kind of drive that has room in `ticks`."""
     whole = f"{ticks * refresh:.4g} {unit}"
     yield PLAIN, "step", f"on at 0 and held for {whole}", _step
-    holds = sorted({max(1, ticks // k) for k in (2, 8, 32, 128)} | {1} & {ticks // 2})
+    holds = sorted({max(1, ticks // k) for k in (2, 8, 32, 128)})
     for hold in reversed(holds):
         dwell = f"{hold * refresh:.4g} {unit}"
         yield f"on/off, {dwell}", "on/off", f"on for {dwell}, off for as long, repeated", _square(hold)
     if ticks >= 2 * _LEVELS:
-        words = f"steps to 1/{_LEVELS}, 2/{_LEVELS}, ... of the range, each followed by as long a rest"
+        words = f"1/{_LEVELS}, 2/{_LEVELS}, ... of the step from rest, each followed by as long a rest"
         yield "amplitude series", "amplitude series", words, _series
         words = f"up and down in {_LEVELS} steps over the whole time"
         yield "staircase", "staircase", words, _staircase
@@ -205,29 +220,29 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
         yield "multisine", "multisine", words, _multisine
 
 
-def _step(ticks: int, rng: np.random.Generator) -> Vector:
+def _step(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
     return np.ones(ticks)
 
 
 def _square(hold: int) -> Shape:
-    def shape(ticks: int, rng: np.random.Generator) -> Vector:
-        return np.asarray((np.arange(ticks) // hold + 1) % 2, dtype=float)
+    def shape(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
+        return np.where(np.arange(ticks) // hold % 2 == 0, 1.0, rest)
 
     return shape
 
 
-def _series(ticks: int, rng: np.random.Generator) -> Vector:
+def _series(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
     part = np.arange(ticks) * 2 * _LEVELS // ticks
-    return np.asarray(np.where(part % 2 == 0, (part // 2 + 1) / _LEVELS, 0.0))
+    return np.where(part % 2 == 0, rest + (1 - rest) * (part // 2 + 1) / _LEVELS, rest)
 
 
-def _staircase(ticks: int, rng: np.random.Generator) -> Vector:
+def _staircase(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
     part = np.arange(ticks) * 2 * _LEVELS // ticks
-    return np.asarray(np.minimum(part + 1, 2 * _LEVELS - 1 - part) / _LEVELS)
+    return np.asarray(rest + (1 - rest) * np.minimum(part + 1, 2 * _LEVELS - 1 - part) / _LEVELS)
 
 
 def _binary(hold: int) -> Shape:
-    def shape(ticks: int, rng: np.random.Generator) -> Vector:
+    def shape(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
         bits = rng.integers(0, 2, -(-ticks // hold)).astype(float)
         bits[0] = 1.0  # nothing is learnt before the first change
         return np.repeat(bits, hold)[:ticks]
@@ -235,7 +250,7 @@ def _binary(hold: int) -> Shape:
     return shape
 
 
-def _telegraph(ticks: int, rng: np.random.Generator) -> Vector:
+def _telegraph(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
     """Dwells log-uniform between one refresh and a quarter of the time."""
     out, at, level = np.empty(ticks), 0, 1.0
     while at < ticks:
@@ -245,7 +260,7 @@ def _telegraph(ticks: int, rng: np.random.Generator) -> Vector:
     return out
 
 
-def _multisine(ticks: int, rng: np.random.Generator) -> Vector:
+def _multisine(ticks: int, rest: float, rng: np.random.Generator) -> Vector:
     """Equal lines at log-spaced harmonics (Schroeder 1970, IEEE Trans. Inf. Theory 16), filling 0 to 1."""
     harmonics = np.unique(np.round(np.geomspace(1, ticks / 4, _LINES)))
     k = np.arange(harmonics.size)

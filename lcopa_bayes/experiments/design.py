@@ -91,8 +91,8 @@ def promises(
 ) -> list[Promise]:
     """What each drive promises at draws (draws, rows) of table values, by `jobs` processes.
 
-    `prior`, (parameters,): standard deviations that count as information beforehand, in the coordinates of
-    `Bench.slopes`; None: the measurement alone.
+    `prior`, (parameters,): standard deviations on the sampled scale that count as information beforehand;
+    None: the measurement alone.
     """
     with workers((bench, drives, repeats, prior), jobs=min(jobs, len(draws))) as crew:
         result = list(crew.each(_covariances, list(draws)))
@@ -109,10 +109,10 @@ def _covariances(
     (bench, drives, repeats, prior), result = shared, []
     known, sizes = StepResponses(), bench.sizes(values)
     for drive in drives:
-        gram = repeats * bench.gram(values, drive.command, known)
-        if prior is not None:
-            gram[np.diag_indices_from(gram)] += prior**-2.0
-        result.append(cramer_rao(gram * np.outer(sizes, sizes)))
+        gram = repeats * bench.gram(values, drive.command, known) * np.outer(sizes, sizes)
+        if prior is not None:  # of a logarithm it is relative already
+            gram[np.diag_indices_from(gram)] += (np.where(bench.logarithmic, 1.0, sizes) / prior) ** 2
+        result.append(cramer_rao(gram))
     return result
 
 

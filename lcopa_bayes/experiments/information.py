@@ -67,6 +67,12 @@ class Bench:
         return tuple(self.problem.posterior.table.names[k] for k in self.columns)
 
     @cached_property
+    def logarithmic(self) -> Flags:
+        """Whether each parameter is sampled by its logarithm, (parameters,)."""
+        rows = self.problem.posterior.table.rows
+        return np.array([rows[k].log_scale for k in self.columns], dtype=bool)
+
+    @cached_property
     def step(self) -> float:
         """Width of a block [time unit]: that of the fit."""
         return min(one.mesh.lattice.step for one in self.problem.posterior.model.experiments)

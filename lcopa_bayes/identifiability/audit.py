@@ -281,11 +281,16 @@ def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) ->
             profiles = list(crew.each(_profile, landscape.free))
         top = max(profiles, key=lambda profile: profile.best)
         better = top.best - peak.log_likelihood
-        if better > 0:
+        surrogate = landscape.precision is not None  # heights of profiles are of the posterior itself
+        if better > 0 or surrogate:
             peak = Peak(top.top, top.best)
-        if better <= _BETTER or landscape.precision is not None:
+        if better <= _BETTER or surrogate:
             break
-    return [replace(profile, best=max(peak.log_likelihood, profile.best)) for profile in profiles], peak
+    held = []
+    for k, one in zip(landscape.free, profiles, strict=True):
+        at = float(np.clip(landscape.coordinate(k, peak.values[k]), *landscape.search(k)))
+        held.append(one.holding(peak, at, landscape.value(k, at)))
+    return held, peak
 
 
 def _first_step(landscape: Landscape, k: int, witnesses: Matrix) -> float:

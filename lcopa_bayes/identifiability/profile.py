@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, final
@@ -105,6 +105,23 @@ class Profile:
     def fall(self) -> Vector:
         """``2 (max L - L)``, (n,) [nat]."""
         return np.maximum(2 * (self.best - self.log_likelihood), 0.0)
+
+    def holding(self, peak: Peak, coordinate: float, value: float) -> Profile:
+        """With a maximum at a value of the parameter as one of its points, where it is higher than all of
+        them."""
+        if peak.log_likelihood <= self.best:
+            return self
+        others = self.coordinates != coordinate
+        at = np.append(self.coordinates[others], coordinate)
+        order = np.argsort(at)
+        return replace(
+            self,
+            coordinates=at[order],
+            values=np.append(self.values[others], value)[order],
+            log_likelihood=np.append(self.log_likelihood[others], peak.log_likelihood)[order],
+            best=peak.log_likelihood,
+            top=peak.values,
+        )
 
     @cached_property
     def intervals(self) -> Mapping[float, tuple[float | None, float | None]]:

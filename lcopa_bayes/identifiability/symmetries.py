@@ -30,13 +30,17 @@ directions that are merely stiff spread over all decades."""
 DIFFERENCED = (3e-5, 1e-5, 3e-6)
 """The same for slopes that are differences, which are good to 1e-6 [-]."""
 _CONSTANT = 1e-4
-"""Entries of a null vector that differ less between points count as the same [-]."""
+"""Entries of a null vector that differ less between points count as the same [-] ..."""
 _PROPORTIONAL = 1e-7
-"""Unit columns closer than this are the same [-]."""
+"""... unit columns closer than this are the same [-] ..."""
+_MOVES = 1e-6
+"""... and from this share of the largest entry a parameter takes part in a null vector [-]: all with exact
+slopes."""
+_ROUGH = 100.0
+"""Error of such entries over the tolerance of the singular values that leaves it: what differs less is not
+told apart, however exact the limits above are [-]."""
 _CLEAR = 6
 """Best conditioned points, from which symmetries are named."""
-_MOVES = 1e-6
-"""Share of the largest entry from which a parameter takes part in a null vector [-]."""
 _NOTHING = 1e-10
 """Relative change of the responses below which a parameter has no effect [-]."""
 
@@ -125,8 +129,9 @@ def structure(
     certain = len(set(ranks.values())) == 1
     if rank < len(kept) and certain:
         clear = np.argsort([-s[rank - 1] for s in spectra], kind="stable")[:_CLEAR]
-        columns, labels, members, grouped = _merged([points[p] for p in clear], [at[p] for p in clear], kept)
-        symmetries += [*grouped, *_directions(columns, labels, members)]
+        near = [points[p] for p in clear], [at[p] for p in clear]
+        columns, labels, members, grouped = _merged(*near, kept, tolerances[1])
+        symmetries += [*grouped, *_directions(columns, labels, members, tolerances[1])]
     best = max(spectra, key=lambda s: float(s[rank - 1]))
     return Structure(tuple(symmetries), len(names), rank, certain, best)
 
@@ -138,14 +143,14 @@ def _spectrum(matrix: Matrix) -> Vector:
 
 
 def _merged(
-    points: Sequence[Matrix], values: Sequence[Vector], names: Sequence[str]
+    points: Sequence[Matrix], values: Sequence[Vector], names: Sequence[str], tolerance: float
 ) -> tuple[list[Matrix], list[str], list[tuple[str, ...]], list[Symmetry]]:
     """Columns with those that are proportional at every point merged; their labels and members; the
     symmetries."""
     unit = [m / np.linalg.norm(m, axis=0) for m in points]
     groups: list[list[int]] = []
     for p in range(len(names)):
-        own = (g for g in groups if all(_same(m[:, g[0]], m[:, p]) for m in unit))
+        own = (g for g in groups if all(_same(m[:, g[0]], m[:, p], tolerance) for m in unit))
         group = next(own, None)
         groups.append([p]) if group is None else group.append(p)
     symmetries, labels, columns = [], [], [np.empty((m.shape[0], len(groups))) for m in points]
@@ -158,12 +163,12 @@ def _merged(
             continue
         shares = np.array([m[:, group[0]] @ m[:, group] / (m[:, group[0]] @ m[:, group[0]]) for m in points])
         sizes = np.array([v[group] / v[group[0]] for v in values])
-        if _constant(shares):
+        if _constant(shares, tolerance):
             powers = _round(shares.mean(axis=0))
             label = " ".join(f"{n}^{p:g}" if p != 1 else n for n, p in zip(members, powers, strict=True))
             symmetries.append(Symmetry("product", members, powers, f"only the product {label} acts"))
             labels[-1] = f"the product {label}"
-        elif _constant(shares / sizes):
+        elif _constant(shares / sizes, tolerance):
             weights = _round((shares / sizes).mean(axis=0))
             parts = (n if w == 1 else f"{w:g} {n}" for n, w in zip(members, weights, strict=True))
             label = " + ".join(parts).replace("+ -", "- ")
@@ -178,20 +183,20 @@ def _merged(
 
 
 def _directions(
-    columns: Sequence[Matrix], labels: Sequence[str], members: Sequence[tuple[str, ...]]
+    columns: Sequence[Matrix], labels: Sequence[str], members: Sequence[tuple[str, ...]], tolerance: float
 ) -> list[Symmetry]:
     """Remaining blind directions, each group counting as one parameter."""
-    kernels = [_kernel(m) for m in columns]
+    kernels = [_kernel(m, tolerance) for m in columns]
     width = min(kernel.shape[1] for kernel in kernels)
     kernels = [kernel for kernel in kernels if kernel.shape[1] == width]
     if not width:
         return []
     reach = np.max([np.abs(kernel).max(axis=1) for kernel in kernels], axis=0)
-    taking = [p for p in range(len(labels)) if reach[p] > _MOVES * reach.max()]
+    taking = [p for p in range(len(labels)) if reach[p] > max(_MOVES, _ROUGH * tolerance) * reach.max()]
     names, parameters = [labels[p] for p in taking], tuple(n for p in taking for n in members[p])
     if width == 1:
         vectors = np.array([k[taking, 0] / k[taking[0], 0] for k in kernels])
-        if _constant(vectors):
+        if _constant(vectors, tolerance):
             powers = _round(vectors.mean(axis=0))
             parts = (n if w == 1 else f"{n} (to the power {w:g})" for n, w in zip(names, powers, strict=True))
             sentence = f"a common factor on {', '.join(parts)} has no effect"
@@ -201,22 +206,24 @@ def _directions(
     return [Symmetry("combination", parameters, (), sentence)]
 
 
-def _kernel(matrix: Matrix) -> Matrix:
+def _kernel(matrix: Matrix, tolerance: float) -> Matrix:
     """Null space in relative changes, (parameters, dimension)."""
     norms = np.linalg.norm(matrix, axis=0)
     _, singular, rows = np.linalg.svd(matrix / norms, full_matrices=True)
-    rank = int(np.sum(singular > TOLERANCES[1] * singular[0]))
+    rank = int(np.sum(singular > tolerance * singular[0]))
     return np.asarray(rows[rank:].T / norms[:, None])
 
 
-def _same(a: Vector, b: Vector) -> bool:
+def _same(a: Vector, b: Vector, tolerance: float) -> bool:
     """Whether two unit columns are the same but for their sign."""
-    return bool(min(np.linalg.norm(a - b), np.linalg.norm(a + b)) < _PROPORTIONAL)
+    apart = min(np.linalg.norm(a - b), np.linalg.norm(a + b))
+    return bool(apart < max(_PROPORTIONAL, tolerance))
 
 
-def _constant(rows: Matrix) -> bool:
+def _constant(rows: Matrix, tolerance: float) -> bool:
     """Whether all points have the same entries."""
-    return bool(np.all(np.ptp(rows, axis=0) <= _CONSTANT * np.abs(rows).max(axis=0)))
+    limit = max(_CONSTANT, _ROUGH * tolerance)
+    return bool(np.all(np.ptp(rows, axis=0) <= limit * np.abs(rows).max(axis=0)))
 
 
 def _round(entries: Vector) -> tuple[float, ...]:

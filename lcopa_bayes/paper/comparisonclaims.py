@@ -106,10 +106,11 @@ def same_steady_state(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
         return undecided("no steady state of both kinds of model is in it.")
     free, whole = (metric for metric in metrics if metric is not None)
     ends = [free["lower"], free["upper"], whole["lower"], whole["upper"]]
-    if None in ends or free["value"] == 0:
-        return undecided("a steady state has an open interval.")
+    if None in ends or free["lower"] <= 0 <= free["upper"]:
+        return undecided("a steady state has an open interval, or may be 0.")
     limit = stated.records.steady_state_error
-    low, high = ends[2] / ends[1] - 1, ends[3] / ends[0] - 1
+    quotients = [theirs / ours - 1 for theirs in ends[2:] for ours in ends[:2]]  # of either sign
+    low, high = min(quotients), max(quotients)
     apart = whole["value"] / free["value"] - 1
     kind = (
         Kind.SUPPORTED

@@ -69,13 +69,14 @@ class Blocks:
         after = times > begin
         knots = np.concatenate(([begin], times[after]))
         heights = np.concatenate(([0.0], values[after]))
-        period = float(times[-1] - times[0]) / (times.size - 1)
-        even = np.abs(np.diff(times) - period).max() < _EVEN * period
-        back = int(np.ceil((times[-1] - begin) / period - 0.5 + 1e-9))
-        if even and back < MOST_BLOCKS:
-            grid = Grid(float(times[-1]) - (back + 0.5) * period, period, back + 1)
-            middles = grid.start + grid.step * (np.arange(grid.n) + 0.5)
-            return cls(grid, drive, np.interp(middles, knots, heights))
+        if times.size > 1:  # else there is no period
+            period = float(times[-1] - times[0]) / (times.size - 1)
+            even = np.abs(np.diff(times) - period).max() < _EVEN * period
+            back = int(np.ceil((times[-1] - begin) / period - 0.5 + 1e-9))
+            if even and back < MOST_BLOCKS:
+                grid = Grid(float(times[-1]) - (back + 0.5) * period, period, back + 1)
+                middles = grid.start + grid.step * (np.arange(grid.n) + 0.5)
+                return cls(grid, drive, np.interp(middles, knots, heights))
         n = min(MOST_BLOCKS, knots.size)
         grid = Grid(begin, float(times[-1] - begin) / n, n)
         return cls(grid, drive, _means(grid, knots, heights))

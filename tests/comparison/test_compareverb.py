@@ -204,6 +204,26 @@ def test_m2_reads_the_distance_of_the_steady_states():
     assert verdict_of("M2", compared()) == "contradicted"
 
 
+def test_m2_reads_steady_states_below_zero_alike():
+    """A camera that counts the other way changes no verdict; an interval that holds 0 has no ratio."""
+    from lcopa_bayes.model.literature import PAPER
+    from lcopa_bayes.paper.comparisonclaims import same_steady_state
+
+    def kind(three: tuple[float, float], whole: tuple[float, float]) -> str:
+        metric = model("", 0, 0, 0.0)["step_metrics"][0]
+        models = {
+            name: {"step_metrics": [metric | {"lower": ends[0], "upper": ends[1], "value": sum(ends) / 2}]}
+            for name, ends in (("three", three), ("whole", whole))
+        }
+        return same_steady_state(PAPER, compared(**models)).kind.value
+
+    assert kind((-0.017951, -0.017949), (-0.017951, -0.017949)) == "supported"
+    assert kind((-0.017951, -0.017949), (-0.018501, -0.018499)) == "contradicted"
+    assert kind((-0.017951, -0.017949), (-0.020, -0.017)) == "undecided"
+    assert kind((-0.018, -0.017), (-0.018, -0.017)) == "undecided"
+    assert kind((-0.001, 0.018), (0.017, 0.018)) == "undecided"
+
+
 def test_a_gain_within_its_error_leaves_m4_open():
     near = compared(two={"log_evidence": 20 - 3.0, "log_evidence_sd": 0.3})
     assert verdict_of("M4", near) == "undecided"

@@ -33,6 +33,7 @@ from lcopa_bayes.experiments.confirmation import confirm, confirmed
 from lcopa_bayes.experiments.design import checked, cramer_rao, design, promises, reached, within
 from lcopa_bayes.experiments.information import Bench, refit
 from lcopa_bayes.experiments.summary import as_json, next_measurement
+from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
@@ -98,6 +99,25 @@ def test_every_candidate_keeps_the_limits_and_the_refresh(ticks, seed, low, high
         assert within(drive, limits), drive.name
         assert drive.command.times.size
         assert drive.command.times[-1] < ticks
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_drives_reach_both_ends_of_a_range_that_holds_rest(sign):
+    """From rest at 0.5 to -1.5 and 3.5, or mirrored: what is low is that, and what is off is rest."""
+    rest, near, far = sign * 0.5, sign * -1.5, sign * 3.5
+    limits = Limits(np.array([rest]), np.array([min(near, far)]), np.array([max(near, far)]), 1.0, 0.1)
+    assert (limits.near, limits.far) == (near, far)
+    drives = {
+        one.family: one.command for one in candidates(limits, 64.0, np.random.default_rng(2), unit="ms")
+    }
+    levels = {family: set(np.unique(one.values)) for family, one in drives.items()}
+    assert levels["step"] == {far}
+    assert levels["on/off"] == {rest, far}
+    assert levels["pseudo-random binary"] == levels["random telegraph"] == {near, far}
+    quarters = {rest + (far - rest) * k / 4 for k in (1, 2, 3, 4)}
+    assert levels["staircase"] == levels["amplitude series"] == quarters | {rest}
+    wave = drives["multisine"].values
+    assert {wave.min(), wave.max()} == {near, far}
 
 
 def test_a_drive_beyond_the_limits_is_seen():
@@ -187,6 +207,28 @@ def test_repeats_and_amplitude_count_as_they_must(noise):
     (small, large), (four, _) = (promises(bench, drives, draws, repeats=k) for k in (1, 4))
     np.testing.assert_allclose(large.relative, small.relative / 2, rtol=1e-6)
     np.testing.assert_allclose(four.relative, small.relative / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.02, 20.0])
+@pytest.mark.parametrize(
+    ("prior", "relative"),
+    [
+        (("loguniform", {"a": 1e-3, "b": 1e3}), np.log(1e6) / np.sqrt(12)),
+        (("norm", {"loc": 0.0, "scale": 5.0}), None),
+    ],
+)
+def test_a_prior_counts_on_the_scale_that_it_has(prior, relative, size):
+    """A drive that excites nothing leaves the standard deviation of the prior, relative to the value."""
+    made = problem(priors={"gain": prior})
+    table = made.posterior.table
+    draws = row_values(table, TRUTH | {"gain": size})[None]
+    landscape, bench = Landscape(made.posterior), Bench(made, 24.0, 0.2)
+    spread = prior_spread(landscape, prior_draws(landscape, np.random.default_rng(1)))[list(bench.columns)]
+    (still,) = promises(bench, [Candidate("still", "", "", quiet())], draws, prior=spread)
+    found = dict(zip(bench.names, still.relative[0], strict=True))
+    assert found["gain"] == pytest.approx(relative or 5.0 / size, rel=0.05)
+    assert found["time_1"] == pytest.approx(spread[bench.names.index("time_1")])
+    assert found["order_1"] == pytest.approx(spread[bench.names.index("order_1")] / TRUTH["order_1"])
 
 
 def test_correlated_noise_costs_what_its_whitening_says():

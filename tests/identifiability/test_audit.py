@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -9,16 +10,24 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
-from small import TRUTH, TWO, draws_of, problem, record
+from small import TRUTH, TWO, draws_of, problem, record, study, with_effect
 
-from lcopa_bayes.bench.command import step
+from lcopa_bayes.bench.command import Command, step
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.identifiability.audit import _flat, radial
+from lcopa_bayes.identifiability.audit import _flat, _profiles, radial
 from lcopa_bayes.identifiability.contraction import Tolerance, beliefs, prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import curvature, sensitivities
 from lcopa_bayes.identifiability.profile import Freedom, Profile, _Path, profile
-from lcopa_bayes.identifiability.symmetries import Structure, printed_form, printed_structure, structure
+from lcopa_bayes.identifiability.symmetries import (
+    DIFFERENCED,
+    TOLERANCES,
+    Structure,
+    printed_form,
+    printed_structure,
+    structure,
+)
 from lcopa_bayes.identifiability.verdict import Finding, judged
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter, Place
@@ -53,17 +62,19 @@ def profile_of(landscape: Landscape, name: str, peak: Peak) -> Profile:
 # -- structure -------------------------------------------------------------------------------------
 
 
-def toy(formula, count: int = 6) -> Structure:
-    """Structure of ``formula(p)`` (samples,) by complex steps, at random points."""
+def toy(formula, count: int = 6, *, error: float = 0.0, tolerances=TOLERANCES) -> Structure:
+    """Structure of ``formula(p)`` (samples,) by complex steps with an error [of the largest], at random
+    points."""
     rng, size = np.random.default_rng(1), formula.__code__.co_argcount
     names = formula.__code__.co_varnames[:size]
     slopes, values = [], []
     for _ in range(count):
         at = rng.uniform(0.5, 2.0, size)
         shifted = at * np.exp(1e-30j * np.eye(size))
-        slopes.append(np.array([formula(*row).imag / 1e-30 for row in shifted]).T)
+        exact = np.array([formula(*row).imag / 1e-30 for row in shifted]).T
+        slopes.append(exact + error * np.abs(exact).max(axis=0) * rng.standard_normal(exact.shape))
         values.append(at)
-    return structure(names, slopes, values)
+    return structure(names, slopes, values, tolerances=tolerances)
 
 
 T = np.linspace(0.1, 3.0, 40)
@@ -89,10 +100,11 @@ T = np.linspace(0.1, 3.0, 40)
     ],
 )
 def test_symmetries_are_found_and_named(formula, rank, reported):
-    found = toy(formula)
-    assert found.rank == rank
-    assert found.certain
-    assert [one.sentence for one in found.symmetries] == reported
+    """By exact slopes, and by slopes that are good to 1e-6 as differences are."""
+    for found in (toy(formula), toy(formula, error=1e-6, tolerances=DIFFERENCED)):
+        assert found.rank == rank
+        assert found.certain
+        assert [one.sentence for one in found.symmetries] == reported
 
 
 def test_the_normalised_path_has_no_symmetry_and_the_printed_one_has_six():
@@ -149,6 +161,24 @@ def test_a_drive_that_never_moves_leaves_its_paths_blind():
 def test_drives_in_proportion_confound_their_gains():
     both = record(device=TWO, command=step((1.0, 0.5), at=0.35), camera=0.5)
     found = structure_of(problem(both, share="all").posterior)
+    assert [one.sentence for one in found.symmetries] == [
+        "only the sum gain_x_x + 0.5 gain_x_y acts",
+        "only the sum gain_y_x + 0.5 gain_y_y acts",
+    ]
+
+
+def test_gains_confounded_by_the_drives_are_named_with_an_effect_too():
+    """Slopes are differences there."""
+    command = Command(np.array([0.35, 4.0]), np.array([[1.0, 0.5], [-0.6, -0.3]]), np.zeros(2))
+    known = {"gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
+    both = study(record(device=TWO, command=command, camera=0.5), share="all")
+    made, truth = with_effect(both, ["odd_curvature"], known | {"coefficient": 0.4})
+    landscape, rng = Landscape(problem_of(made).posterior), np.random.default_rng(1)
+    points = [sensitivities(landscape, truth * (1 + 0.1 * rng.random(truth.size))) for _ in range(3)]
+    slopes, values = [p.relative() for p in points], [p.values for p in points]
+    found = structure(points[0].names, slopes, values, tolerances=DIFFERENCED)
+    assert found.certain
+    assert found.rank == found.parameters - 2
     assert [one.sentence for one in found.symmetries] == [
         "only the sum gain_x_x + 0.5 gain_x_y acts",
         "only the sum gain_y_x + 0.5 gain_y_y acts",
@@ -230,6 +260,38 @@ def test_a_profile_is_extended_from_an_end_that_is_inside():
     path.extend_ends()
     outermost = [path.fall(path.points[end]) for end in (min(path.points), max(path.points))]
     assert min(outermost) > path.beyond
+
+
+@pytest.mark.parametrize("error", [0.3, 3.0])
+def test_a_surrogate_that_is_too_high_moves_no_profile(error, monkeypatch):
+    """Heights are those of the posterior itself, that of the maximum among them."""
+    known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"]}
+    plain = Landscape(problem(SHORT, priors=known).posterior)
+    peak = plain.maximise(np.array([TRUTH[name] for name in plain.posterior.table.names]))
+    near = peak.values + 0.01 * np.array([[-1.0], [1.0]])
+    intervals = [profile(plain, k, peak, near, 1e-3).intervals[0.9] for k in plain.free]
+    monkeypatch.setattr(Landscape, "exact", lambda self, values: plain.log_likelihood(values) - error)
+    surrogate = replace(plain, precision=np.eye(2) / 0.01**2)
+    found, best = _profiles(surrogate, peak, near, 1)
+    assert best.log_likelihood == pytest.approx(peak.log_likelihood - error, abs=1e-3)
+    for one, (low, high) in zip(found, intervals, strict=True):
+        assert one.best == best.log_likelihood
+        assert_allclose(one.intervals[0.9], (low, high), atol=0.02 * (high - low))
+
+
+def test_a_profile_holds_a_maximum_that_another_one_has_found():
+    """Else no point is within the interval of the highest level, and the interval has no ends."""
+    u = np.linspace(-1.0, 1.0, 21)
+    own = Profile("a", "-", u, u, -50 * u**2, 0.0, (), (-1.0, 1.0), (), np.zeros(1), Freedom(9, 1, True))
+    assert own.holding(Peak(np.ones(1), -0.1), 0.35, 0.35) is own
+    for at in (0.35, float(u[14])):
+        held = own.holding(Peak(np.ones(1), 2.0), at, at)
+        assert held.best == 2.0
+        assert held.top == 1.0
+        assert np.all(np.diff(held.coordinates) > 0)
+        assert held.values[np.argmin(held.fall)] == at
+        for low, high in held.intervals.values():
+            assert low < at < high
 
 
 def test_points_are_searched_again_from_the_neighbours_they_did_not_begin_at(monkeypatch):

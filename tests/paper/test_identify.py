@@ -121,6 +121,16 @@ def test_other_samples_are_joined_by_straight_lines():
         assert blocks.response[k] == pytest.approx(mean, abs=1e-10)
 
 
+def test_a_record_of_one_sample_is_a_straight_line_to_it():
+    """Beside one of many samples, from which the path is identified."""
+    lone = table([0.0, 1.0, 4.0], [0.0, 2.0, 2.0], [np.nan, np.nan, 0.3], name="lone")
+    data = data_of(clean(), lone)
+    blocks = data.records[1].blocks
+    assert (blocks.grid.start, blocks.grid.edges[-1]) == (1.0, 4.0)
+    assert_allclose(blocks.response, 0.0)  # its own level is all that is known of it
+    assert np.isfinite(output_rmse(data.records, path(1.0, 0.5, (1.0, 2.0), (1.5, 0.5))))
+
+
 def test_a_long_record_is_taken_in_block_means():
     times = 0.01 * np.arange(5001)
     record_ = table([-0.01, *times], [0.0, *np.ones(5001)], [np.nan, *(1 - np.exp(-times))])
