@@ -19,7 +19,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
-from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, refit
+from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, paid, refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, on, shift_by_width
 from lcopa_bayes.effectsearch.rounds import Round, Search
@@ -309,8 +309,10 @@ def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | N
     larger = richer.state if richer else wider.start
     same = Regression(smaller.model, larger.whitening).descend(smaller.optimum.x)
     ordering = wider.fit.model.plant.table.log_support - base.fit.model.plant.table.log_support
-    paid = (richer.paid if richer else 0.0) - (named.paid if named else 0.0)
-    return log_bayes_factor(same, larger.optimum, quiet) + ordering + paid
+    own, theirs = (
+        paid(one.model, [effect.name for effect in one.model.effects]) for one in (larger, smaller)
+    )
+    return log_bayes_factor(same, larger.optimum, quiet) + ordering + own - theirs
 
 
 def _named(

@@ -123,8 +123,9 @@ class ExtendedModel:
         return np.array([one.coefficient.scale * wider[one.effect] for one in self.effected.coefficients])
 
     def sizes(self, x: Vector) -> tuple[tuple[Effect, Vector], ...]:
-        """The effects, each with its coefficients at coordinates over their prior sd [-]."""
-        psi, placed = x[self.plant_size :] / self.scale, self.effected.coefficients
+        """The effects, each with its coefficients at coordinates over their default prior sd [-]."""
+        placed = self.effected.coefficients
+        psi = x[self.plant_size :] / np.array([one.coefficient.scale for one in placed])
         owners = np.array([one.effect for one in placed], dtype=int)
         return tuple((effect, psi[owners == e]) for e, effect in enumerate(self.effects))
 

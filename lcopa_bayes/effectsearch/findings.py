@@ -48,15 +48,11 @@ class Side:
     fit: tuple[Score, ...]
     unseen: tuple[Score, ...]
     """On held-out records, or with each fit record left out in turn."""
-    log_evidence: float
-    """Laplace approximation, noise held at its estimate [nat]."""
 
     @classmethod
     def of(cls, problem: Problem, state: State) -> Self:
         """Those of a state."""
-        unseen = unseen_scores(state, problem)
-        log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
-        return cls(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)
+        return cls(state, tuple(fit_scores(state)), tuple(unseen_scores(state, problem)))
 
     @classmethod
     def drawn(cls, problem: Problem, state: State, sampled: tuple[Draws, Noise]) -> Self:
@@ -95,16 +91,17 @@ def findings_of(
     alone: bool,
 ) -> Findings:
     """What a search found, `before` without its effects and `after` with them."""
-    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    first, end = searched.rounds[0].trace, searched.rounds[-1]
     generic, added, names = first.generic, searched.state.model.effects, named_effects(searched.state)
     by_record = bool(added) and all(effect.card.per_record for effect in added)
     was, now, varying = before.unseen, after.unseen, tuple[str, ...]()
     # where something remains, what is free in every record takes up some of it in these too
-    if study.held_out and not last.alarmed and not by_record:
+    if study.held_out and not end.alarmed and not by_record:
         varying = tuple(effect.name for effect in added if effect.card.per_record)
         now = tuple(given_their_records(now, searched.state))
     if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
         was, now = without_outliers(was, now)
+    last, (remaining, what) = end.trace, end.strongest
     return Findings(
         cautions=cautions,
         alarmed=searched.rounds[0].alarmed or bool(added),
@@ -117,9 +114,9 @@ def findings_of(
         gained=searched.gained,
         generic=generic.log_bayes_factor if generic else -np.inf,
         generic_name=generic.name if generic else "",
-        remaining=last.largest,
+        remaining=remaining if end.alarmed else -np.inf,
         remaining_threshold=last.threshold,
-        remaining_name=last.leader.name if last.leader else "",
+        remaining_name=what,
         share=searched.share,
         excess=before.state.whitening.excess(before.state.optimum.residual),
         enough=ALONE if alone else EXPLAINED,
@@ -127,7 +124,7 @@ def findings_of(
         missed=None if by_record else missed(study, after.fit, now, searched.state),
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
         risen=np.nan if by_record else risen(was, now),
-        reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
+        reached=np.nan if by_record else over_noise(after.fit, now, clear=not end.alarmed),
         varying=varying,
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )

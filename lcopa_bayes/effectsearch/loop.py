@@ -130,7 +130,6 @@ class _Begun:
     base: Base
     outliers: Outlying | None
     contrary: tuple[Disagreement, ...]
-    cautions: tuple[str, ...]
     chosen: bool
     """Whether the search chooses the structure of the plant."""
 
@@ -146,9 +145,19 @@ class _Begun:
             crew.stage("fitting the plant again, without outlying samples")
             base = based(study, kinds)
         contrary = disagreements((*study.fit, *study.held_out), crew)
-        drifting = (one.as_drift for one in not_at_rest(base.problem.study.fit, base.problem.study.held_out))
-        cautions = (*map(str, contrary), *drifting, *base.fit.caution, *single_record(study))
-        return cls(study, kinds, base, outliers, contrary, cautions, chosen)
+        return cls(study, kinds, base, outliers, contrary, chosen)
+
+    @cached_property
+    def cautions(self) -> tuple[str, ...]:
+        """What limits a verdict from this base fit."""
+        based = self.base.problem.study
+        drifting = (one.as_drift for one in not_at_rest(based.fit, based.held_out))
+        return (
+            *map(str, self.contrary),
+            *drifting,
+            *self.base.fit.caution,
+            *single_record(self.study),
+        )
 
     @property
     def alone(self) -> bool:
@@ -223,7 +232,8 @@ class _Begun:
         seen = missed(study, before.fit, before.unseen, self.base.start)
         but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
         verdict = Verdict("unexplained", "tentative", f"No effect is named, because {obstacle}.{but}")
-        return self.ending(verdict, before, before)
+        wide = Side.of(self.base.problem, _wide(self.base.start))
+        return self.ending(verdict, wide, wide)
 
     def ending(self, verdict: Verdict, before: Side, after: Side) -> Loop:
         """A loop without rounds and draws, of one plant alone."""
@@ -242,6 +252,12 @@ class _Begun:
             outliers=self.outliers,
             contrary=self.contrary,
         )
+
+
+def _wide(state: State) -> State:
+    """A state with bands that hold what remains."""
+    white = state.whitening
+    return replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
 
 
 @final
@@ -297,8 +313,7 @@ class _Judged:
         state = self.after.state
         if not (self.verdict.leaves or self.searched.rounds[-1].alarmed):
             return state
-        white = state.whitening
-        return replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
+        return _wide(state)
 
     def sampled(self, options: _Options) -> Loop:
         """The loop, by draws of the explained study where there are any that predict as its optimum does."""

@@ -36,9 +36,9 @@ class OtherPlant:
     def beside(cls, chosen: State, model: ExtendedModel, optimum: Optimum) -> Self:
         """At its optimum, beside the chosen plant at its own."""
         squares = (at.white @ at.white for at in (chosen.optimum, optimum))
-        ordering = model.plant.table.log_support - chosen.model.plant.table.log_support
-        evidence = optimum.log_evidence - chosen.optimum.log_evidence + ordering
-        return cls(State(model, optimum, chosen.whitening), float(np.subtract(*squares)) / 2, evidence)
+        state = State(model, optimum, chosen.whitening)
+        evidence = state.log_evidence - chosen.log_evidence
+        return cls(state, float(np.subtract(*squares)) / 2, evidence)
 
     @cached_property
     def draws(self) -> Matrix:

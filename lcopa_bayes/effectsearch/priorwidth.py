@@ -6,7 +6,7 @@ Student law of 1.7 degrees of freedom. Shares of an effect keep one width: more 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,14 +31,19 @@ _STEPS = 4
 """How often it is widened at most [-]."""
 
 
-def widened(model: ExtendedModel, added: Sequence[tuple[Effect, Vector]]) -> tuple[ExtendedModel, float]:
+def widened(model: ExtendedModel, added: Sequence[tuple[Effect, Vector]]) -> ExtendedModel:
     """The model with priors that hold linear estimates of `added` effects, which narrow ones would keep a
-    descent from, and what the evidence pays for that [nat]."""
+    descent from."""
     shares = {model.effects[one.effect].name for one in _shares(model)}
     steps = {effect.name: _steps(psi) for effect, psi in added if effect.name not in shares}
     more = {name: WIDER**count for name, count in steps.items() if count}
-    paid = sum(steps.values()) * float(np.log(COMMON))
-    return (replace(model, wider={**model.wider, **more}), paid) if more else (model, 0.0)
+    return replace(model, wider={**model.wider, **more}) if more else model
+
+
+def rarity(model: ExtendedModel, names: Collection[str]) -> float:
+    """What the evidence pays for priors of effects `names` that are wider than the default ones [nat]."""
+    factors = [model.wider.get(name, 1.0) for name in names]
+    return float(np.log(COMMON) * np.log(factors).sum() / np.log(WIDER))
 
 
 def _shares(model: ExtendedModel) -> list[Placed]:
@@ -54,23 +59,22 @@ def _steps(psi: Vector) -> int:
 
 def with_room(
     model: ExtendedModel, optimum: Optimum, whitening: Whitening, names: Sequence[str]
-) -> tuple[ExtendedModel, Optimum, float]:
+) -> tuple[ExtendedModel, Optimum]:
     """Model and optimum with priors of the effects `names` so wide that these do not pull their coefficients
-    back, and what the evidence pays for that [nat].
+    back.
 
     A prior a normal law's tail away from the data biases the coefficient, and what it takes away would look
     like a further effect. Scales four times as large are a tenth as common: together a prior with the tails
     of a Student law of 1.7 degrees of freedom.
     """
-    rare = 0.0
     for _ in range(_STEPS):
         apart = np.abs(optimum.x[model.plant_size :]) / model.scale
         placed = zip(model.effected.coefficients, apart, strict=True)
         beyond = (one for one, size in placed if size > _FAR and not one.coefficient.share)
         far = {model.effects[one.effect].name for one in beyond} & set(names)
         if not far:
-            return model, optimum, rare
+            break
         more = {name: WIDER * model.wider.get(name, 1.0) for name in far}
-        model, rare = replace(model, wider={**model.wider, **more}), rare + len(far) * float(np.log(COMMON))
+        model = replace(model, wider={**model.wider, **more})
         optimum = Regression(model, whitening).descend(optimum.x, most=12, gain=0.02)
-    return model, optimum, rare
+    return model, optimum

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -17,7 +17,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.freedconstants import freed
 from lcopa_bayes.effectsearch.leavingout import groups, log_scores
 from lcopa_bayes.effectsearch.noise import quiet_samples
-from lcopa_bayes.effectsearch.priorwidth import widened, with_room
+from lcopa_bayes.effectsearch.priorwidth import rarity, widened, with_room
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Scale
@@ -54,13 +54,18 @@ class Refit:
     """Names of the effects that are new."""
     quiet: float
     """Samples the noise scale is known from [-]."""
-    paid: float
-    """Evidence of signs that are known less that of the choice among what was tried [nat]."""
+    choice: float = 0.0
+    """What the evidence pays for a choice among pairs [nat]."""
 
     @cached_property
     def log_bayes_factor(self) -> float:
         """Laplace evidence over that of the plant before [nat]."""
         return log_bayes_factor(self.before, self.optimum, self.quiet) + self.paid
+
+    @property
+    def paid(self) -> float:
+        """Evidence of signs that are known less that of the choice among what was tried [nat]."""
+        return paid(self.model, self.added) - self.choice
 
     @cached_property
     def left_out(self) -> float:
@@ -129,9 +134,8 @@ class Refit:
         before = Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR)
         optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
         optimum = _no_worse(self.model, whitening, optimum, before)
-        model, optimum, rare = with_room(self.model, optimum, whitening, self.added)
-        paid = self.paid - rare
-        return replace(self, model=model, optimum=optimum, before=before, whitening=whitening, paid=paid)
+        model, optimum = with_room(self.model, optimum, whitening, self.added)
+        return replace(self, model=model, optimum=optimum, before=before, whitening=whitening)
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero, over all noise that is plausible [-]."""
@@ -241,7 +245,7 @@ def refit(
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     size = sum(psi.size for _, psi in added)
     linear = np.concatenate([psi for _, psi in added]) * extended.scale[-size:]
-    extended, common = widened(extended, added)
+    extended = widened(extended, added)
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
@@ -259,11 +263,8 @@ def refit(
         extended, start = freed(extended, quick, whitening, names)
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)
-    extended, optimum, rare = with_room(extended, optimum, whitening, names)
-    sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-size:])
-    tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
-    paid = sides * float(np.log(2.0)) - float(tried) - common - rare
-    return Refit(extended, optimum, before, whitening, names, quiet, paid)
+    extended, optimum = with_room(extended, optimum, whitening, names)
+    return Refit(extended, optimum, before, whitening, names, quiet)
 
 
 def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:
@@ -288,6 +289,19 @@ def under_one_noise(candidates: Sequence[Refit]) -> list[Refit]:
         noise = renewed(least.model, least.optimum, least.whitening)
         candidates = [one.under(noise) for one in candidates]
     return sorted(candidates, key=lambda one: -one.log_bayes_factor)
+
+
+def paid(model: ExtendedModel, names: Collection[str]) -> float:
+    """Evidence of known signs of coefficients of effects `names` of a model, less that of the choice among
+    their instances and of priors wider than the default ones [nat]."""
+    out = -rarity(model, names)
+    for effect in model.effects:
+        if effect.name in names:
+            out -= float(np.log(len(effect.grid(model.effected.ranges))))
+    for one in model.effected.coefficients:
+        if model.effects[one.effect].name in names and one.coefficient.one_signed:
+            out += float(np.log(2.0))
+    return out
 
 
 def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:

@@ -17,6 +17,7 @@ from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
     Refit,
     log_bayes_factor,
+    paid,
     refit,
     under_one_noise,
     without,
@@ -75,12 +76,19 @@ class Round:
         return next((one for one in likely if not one.dynamics), None)
 
     @property
-    def largest(self) -> float:
+    def strongest(self) -> tuple[float, str]:
         """Largest log Bayes factor of an effect that changes the response, of one that was refitted that of
-        its refit, which the straight line of the trace only estimates [nat]; -inf without any."""
+        its refit, which the straight line of the trace only estimates [nat], and its name; -inf without
+        any."""
         known = {one.added[0]: one.log_bayes_factor for one in self.refits if len(one.added) == 1}
         changing = (one for one in self.trace.traced if not one.scatters)
-        return max((known.get(one.name, one.log_bayes_factor) for one in changing), default=-np.inf)
+        each = ((known.get(one.name, one.log_bayes_factor), one.name) for one in changing)
+        return max(each, default=(-np.inf, ""))
+
+    @property
+    def largest(self) -> float:
+        """That evidence [nat]."""
+        return self.strongest[0]
 
     @property
     def alarmed(self) -> bool:
@@ -109,13 +117,14 @@ class Search:
     @classmethod
     def ending(cls, rounds: Sequence[Round], groups: Mapping[str, tuple[str, ...]]) -> Self:
         """With what the last round looked at."""
-        start, state, last = rounds[0].state, rounds[-1].state, rounds[-1].trace
+        start, state, last = rounds[0].state, rounds[-1].state, rounds[-1]
         confounded = (groups.get(effect.name, (effect.name,)) for effect in state.model.effects)
-        gained, dropped = _gained(start, state, last.scale.quiet)
-        left = last.scale.drop(rounds[-1].largest) if last.alarmed else 0.0
+        scale = last.trace.scale
+        gained, dropped = _gained(start, state, scale.quiet)
+        left = scale.drop(last.largest) if last.alarmed else 0.0
         share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
         worth = [one.chosen.log_bayes_factor for one in rounds if one.chosen]
-        worth += _beside_others(state, last.scale.quiet)
+        worth += _beside_others(state, scale.quiet)
         least = min(worth, default=np.inf)
         return cls(tuple(rounds), state, tuple(confounded), gained, share, least)
 
@@ -124,7 +133,7 @@ class Search:
         """Whether every effect brought enough evidence for a firm name and is confounded with no other, and
         nothing that another name might explain too remains."""
         alone = all(len(each) == 1 for each in self.groups)
-        return self.brought >= FIRM and alone and not self.rounds[-1].trace.alarmed
+        return self.brought >= FIRM and alone and not self.rounds[-1].alarmed
 
     @property
     def best(self) -> Refit | None:
@@ -253,7 +262,8 @@ def _beside_others(state: State, quiet: float) -> list[float]:
     for effect in state.model.effects if len(state.model.effects) > 1 else ():
         model, x = without(state.model, state.optimum.x, [effect.name])
         fewer = Regression(model, state.whitening).descend(x, most=12, gain=0.02)
-        worth.append(log_bayes_factor(fewer, state.optimum, quiet))
+        own = paid(state.model, [effect.name])
+        worth.append(log_bayes_factor(fewer, state.optimum, quiet) + own)
     return worth
 
 
@@ -265,8 +275,8 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     plain = start.optimum
     if state.whitening is not start.whitening:
         plain = Regression(start.model, state.whitening).descend(start.optimum.x)
-    sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
-    gained = log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
+    own, had = (paid(one.model, [effect.name for effect in one.model.effects]) for one in (state, start))
+    gained = log_bayes_factor(plain, state.optimum, quiet) + own - had
     return gained, plain.cost - state.optimum.cost
 
 
@@ -281,7 +291,8 @@ def _kept(candidate: Refit) -> State:
         return candidate.state
     model, x = candidate.without(idle)
     optimum = Regression(model, candidate.whitening).descend(x, most=12, gain=0.02)
-    if log_bayes_factor(optimum, candidate.optimum, candidate.quiet) > MARGIN:
+    worth = log_bayes_factor(optimum, candidate.optimum, candidate.quiet) + paid(candidate.model, idle)
+    if worth > MARGIN:
         return candidate.state
     return State(model, optimum, candidate.whitening)
 
@@ -329,7 +340,7 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
             candidate = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
         except ArithmeticError:
             continue
-        candidate = replace(under_one_noise([candidate])[0], paid=candidate.paid - choice)
+        candidate = replace(under_one_noise([candidate])[0], choice=choice)
         if candidate.log_bayes_factor > bar and acceptable(candidate, seen, seen.threshold):
             bar, best = candidate.log_bayes_factor, candidate
     return best

@@ -105,6 +105,11 @@ class State:
         return self.optimum.covariance if self.spread is None else self.spread
 
     @property
+    def log_evidence(self) -> float:
+        """Laplace approximation, noise held at its estimate [nat]."""
+        return self.optimum.log_evidence + self.model.plant.table.log_support
+
+    @property
     def fitted(self) -> Vector:
         """Responses at the samples, stacked [response unit]."""
         return self.whitening.observed - self.optimum.residual

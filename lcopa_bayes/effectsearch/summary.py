@@ -107,7 +107,7 @@ def side(one: Side, result: Loop) -> dict[str, Any]:
         "fit_coverage_90": pooled_coverage(one.fit),
         "held_out_coverage_90": pooled_coverage(one.unseen),
         "held_out_level_from": sorted({score.level_from for score in one.unseen}),
-        "log_evidence": one.log_evidence,
+        "log_evidence": one.state.log_evidence,
         "scores": [score.as_json() for score in (*one.fit, *one.unseen)],
     }
 
@@ -262,13 +262,13 @@ def words(numbers: dict[str, Any]) -> Sequence[str]:
             f"  {p['name']} = {p['value']:.4g} [{p['lower']:.4g}, {p['upper']:.4g}] {p['unit']}, {p['grade']}"
             for p in effect["parameters"][:6]
         ]
-    after = numbers["after"]
-    for axis, value in numbers["before"]["fit_rmse"].items():
-        out.append(
-            f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
-            f"{numbers['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
-            f"({numbers['unseen_by']})"
-        )
+    before, after = numbers["before"], numbers["after"]
+    for axis, value in before["fit_rmse"].items():
+        said = f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}"
+        unseen = before["held_out_rmse"][axis], after["held_out_rmse"][axis]
+        if None not in unseen:  # no held-out record may have a sample of this axis
+            said += f", unseen {unseen[0]:.4g} -> {unseen[1]:.4g} ({numbers['unseen_by']})"
+        out.append(said)
     coverage = [numbers[side]["held_out_coverage_90"] for side in ("before", "after")]
     if None not in coverage:
         first, last = (f"{100 * share:.0f} %" for share in coverage)

@@ -124,9 +124,10 @@ class Trace:
 
     @cached_property
     def probabilities(self) -> dict[str, float]:
-        """Posterior probability of each effect and of "none", if exactly one of them is there [-]."""
-        share = np.log((1 - _NONE) / max(len(self.traced), 1))
-        logs = np.array([np.log(_NONE), *(one.log_bayes_factor + share for one in self.traced)])
+        """Posterior probability of each effect and of "none", if exactly one of them is there [-]. Evidence
+        counts in what chance gives, as it does for a verdict (`openeffects.odds`)."""
+        share, worth = np.log((1 - _NONE) / max(len(self.traced), 1)), LEAST / self.threshold
+        logs = np.array([np.log(_NONE), *(worth * one.log_bayes_factor + share for one in self.traced)])
         chances = np.exp(logs - logsumexp(logs))
         return dict(zip(("none", *(one.name for one in self.traced)), chances.tolist(), strict=True))
 

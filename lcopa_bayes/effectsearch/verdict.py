@@ -131,7 +131,8 @@ class Findings:
     """Largest log Bayes factor of a generic class in the first residual [nat]; -inf without any."""
     generic_name: str
     remaining: float
-    """Largest log Bayes factor of any class in the last residual [nat]."""
+    """Largest log Bayes factor of any class in the last residual [nat]; -inf where a refit refutes it, or
+    nothing is above what chance gives."""
     remaining_threshold: float
     """[nat]."""
     remaining_name: str
@@ -180,23 +181,36 @@ def decide(given: Findings) -> Verdict:
         apart = apart and not (given.linear and given.linear.astray)
         return Verdict("unexplained", confidence if apart else "tentative", refused)
     named, one = ", ".join(given.effects), len(given.effects) == 1
-    rest = " Nothing significant remains."
-    if given.remaining > given.remaining_threshold:
+    remains = given.remaining > given.remaining_threshold
+    rest = ""
+    if remains:
         rest = (
             f" What remains is significant ({given.remaining_name}, {given.remaining:.0f} nat) but small: "
             f"{_percent(given.share)} of what the base model leaves to explain is accounted for."
         )
     confidence = confidence if given.apart else "tentative"
     said = f"{named} {'was' if one else 'were'} missing"
-    astray = given.missed is not None and given.missed.significant
-    if given.dynamics or astray or given.reached > REACHED:
+    missed, above = given.missed, given.reached > REACHED
+    astray = missed is not None and missed.significant
+    if given.dynamics or astray or above:
+        rest = rest or " Nothing significant remains in the fitted records."
         rest += " Linear dynamics without a name are missing too." if given.dynamics else ""
-        if given.reached > REACHED:
-            rest += f" On unseen records the error stays at {given.reached:.2f} times the noise."
-        elif astray and given.missed:
-            rest += f" But {given.missed.said}."
-        said += f", but not all that is, worth {given.gained:.0f} nat together."
+        perhaps = ""
+        if above:
+            rest += f" On unseen records the error stays at {given.reached:.2f} times the noise"
+            if missed is not None and missed.far and not (astray or remains or given.dynamics):
+                perhaps = "perhaps "
+                rest += f", which chance gives with probability {missed.p:.2g}"
+            rest += "."
+        elif missed is not None:
+            rest += f" But {missed.said}."
+        together = "" if one and not given.dynamics else " together"
+        said += f", but {perhaps}not all that is, worth {given.gained:.0f} nat{together}."
         return Verdict("partly explained", "tentative", said + rest)
+    rest = rest or " Nothing significant remains."
+    if missed is not None and missed.far:
+        confidence = "tentative"
+        rest += f" But {missed.said}."
     if set(given.effects) <= set(given.disturbances):
         verb = "disturbs" if one else "disturb"
         said = f"{named} {verb} the records; the plant stays as it is, the noise model changes."

@@ -24,7 +24,7 @@ from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import Round
+from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import risen
 from lcopa_bayes.effectsearch.summary import drawn, next_measurement, results, words
 from lcopa_bayes.effectsearch.verdict import COVERED, Dynamics, Findings, Miss, decide
@@ -422,6 +422,10 @@ FOUND = Findings((), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0
         ({"risen": 1.06}, "unexplained"),
         ({"reached": 1.09}, "explained"),
         ({"reached": 1.11}, "partly explained"),
+        ({"reached": 1.11, "missed": Miss("y", 1.11, 0.88, 0.019)}, "partly explained"),
+        ({"reached": 1.11, "missed": Miss("y", 1.11, 0.88, 0.3)}, "partly explained"),
+        ({"reached": 1.09, "missed": Miss("y", 1.09, 0.8, 0.019)}, "partly explained"),
+        ({"reached": 1.09, "missed": Miss("y", 1.09, 0.8, 0.021)}, "explained"),
         ({"dynamics": True}, "partly explained"),
         ({"dynamics": True, "effects": ()}, "unexplained"),
     ],
@@ -434,6 +438,76 @@ def test_a_verdict_says_given_what_held_out_records_were_judged():
     said = decide(replace(FOUND, effects=("a", "b"), varying=("b",), reached=1.02)).sentence
     assert "Given b of each held-out record, which no other record tells, the error there is 1.02" in said
     assert "Given" not in decide(replace(FOUND, reached=1.02)).sentence
+
+
+def test_what_chance_may_explain_is_said_beside_a_name():
+    """And takes the firmness of the verdict, as beside `clean`; above 1.1 times the noise no name is all."""
+    above = decide(replace(FOUND, reached=1.12, missed=Miss("y", 1.12, 0.88, 0.3)))
+    assert (above.kind, above.confidence) == ("partly explained", "tentative")
+    assert "but perhaps not all that is" in above.sentence
+    assert "1.12 times the noise, which chance gives with probability 0.3." in above.sentence
+    left = decide(replace(FOUND, reached=1.12, missed=Miss("y", 1.12, 0.88, 0.3), remaining=4.0, share=0.96))
+    assert "but not all that is" in left.sentence
+    assert "chance" not in left.sentence
+    uncovered = decide(replace(FOUND, missed=Miss("y", 1.0, 0.8, 0.3)))
+    assert (uncovered.kind, uncovered.confidence) == ("explained", "tentative")
+    assert "(by chance with probability 0.3)" in uncovered.sentence
+    disturbed = decide(replace(FOUND, disturbances=("a",), missed=Miss("y", 1.0, 0.8, 0.3)))
+    assert (disturbed.kind, disturbed.confidence) == ("disturbance", "tentative")
+    assert decide(replace(FOUND, missed=Miss("y", 1.0, 0.9, 0.3))).confidence == "firm"
+
+
+def test_something_that_is_missing_is_not_said_to_be_nothing():
+    """Of errors on unseen records alone: the fitted ones show nothing more."""
+    one = decide(replace(FOUND, reached=1.3)).sentence
+    assert "a was missing, but not all that is, worth 48 nat. Nothing significant remains in the" in one
+    two = decide(replace(FOUND, effects=("a", "b"), reached=1.3)).sentence
+    assert "a, b were missing, but not all that is, worth 48 nat together." in two
+
+
+def test_what_remains_must_hold_against_the_refit(bent):
+    """As at the first look: straight lines alone said that something significant remains, and shares of more
+    than the whole."""
+    *before, last = bent.rounds
+    first, *others = last.trace.traced
+    seen = replace(last.trace, traced=(replace(first, log_bayes_factor=20.0), *others))
+    every = [SimpleNamespace(added=(one.name,), log_bayes_factor=-5.0) for one in seen.traced]
+    sides = bent.before, bent.after
+    given = {"outliers": None, "cautions": (), "alone": False}
+
+    def found(*refits):
+        searched = Search.ending((*before, replace(last, trace=seen, refits=refits)), {})
+        return findings.findings_of(bent.problem.study, searched, *sides, **given)
+
+    alarm, none = found(), found(*every)
+    assert (alarm.remaining, alarm.remaining_name) == (20.0, first.name)
+    assert not alarm.apart
+    assert alarm.share < 1.0
+    assert none.remaining < none.remaining_threshold
+    assert none.apart
+    assert none.share == 1.0
+    assert "Nothing significant remains." in decide(none).sentence
+
+
+def test_cautions_are_those_of_the_base_fit_that_is_searched(clean):
+    """Not of one that a richer plant took the place of."""
+
+    def cautions(*said):
+        base = SimpleNamespace(problem=clean.problem, fit=SimpleNamespace(caution=said))
+        return replace(begun, base=base).cautions
+
+    begun = loops._Begun(clean.problem.study, (), None, None, (), True)
+    assert cautions() == ()
+    assert cautions("time_1 at the end of the prior") == ("time_1 at the end of the prior",)
+
+
+def test_an_axis_that_no_held_out_record_shows_has_no_error_there(clean):
+    """A held-out record with an empty column: None is no number that a line could show."""
+    said = results(clean)
+    before, after = ({**said[side], "held_out_rmse": {"x": None}} for side in ("before", "after"))
+    (line,) = [one for one in words({**said, "before": before, "after": after}) if one.startswith("axis x")]
+    assert "unseen" not in line
+    assert any(", unseen 0.00" in one for one in words(said))
 
 
 def test_an_alarm_of_the_trace_must_hold_against_the_refit():

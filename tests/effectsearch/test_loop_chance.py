@@ -19,6 +19,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.heldouteffects import Errors
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import FEWEST, Law, joint_noise
+from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import Trace, Traced, against_chance, threshold_of
@@ -342,3 +343,15 @@ def test_chance_is_drawn_until_the_threshold_is_clear_of_the_evidence():
         assert seen.draws == expected
         assert seen.p_value == (np.count_nonzero(drawn[:expected] >= largest) + 1) / (expected + 1)
         assert seen.threshold == threshold_of(drawn[:expected])[0]
+
+
+@pytest.mark.parametrize("threshold", [3.0, 12.0])
+def test_probabilities_are_those_of_the_verdict(threshold):
+    """Evidence of 8 nat is little where chance alone gives 12."""
+    cards = [catalogue()[name].card for name in ("odd_curvature", "gain_drift")]
+    found = tuple(Traced(card, (None,), size, 0) for card, size in zip(cards, (8.0, -1.0), strict=True))
+    ends = threshold, threshold
+    seen = Trace(found, threshold, ends, 0.5, 100, np.zeros(0), Scale(0.0, 1.0, np.ones(1)))
+    verdict = 1 / (1 + sum(odds(seen, one.log_bayes_factor) for one in found))
+    assert seen.probabilities["none"] == pytest.approx(verdict)
+    assert (verdict > 0.15) == (threshold > 3.0)

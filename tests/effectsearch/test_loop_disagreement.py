@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from small import TWO, record, study
+from test_loop import study as study_at_rest
 
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.scores import fit_scores, pooled_coverage
 from lcopa_bayes.effectsearch.summary import results, words
 from lcopa_bayes.model.effects.catalogue import catalogue
 
@@ -52,6 +54,25 @@ def test_no_effect_is_named_from_records_that_no_plant_follows(name):
     assert all(f"'{one}'" in found.verdict.sentence for one in found.contrary[0].records)
     assert str(found.contrary[0]) in found.cautions
     assert results(found)["next_measurement"] == "Correct the records that disagree first."
+
+
+def test_bands_hold_what_a_plant_does_not_follow():
+    """Noise that is measured at rest gives bands which hold one sample in sixty; those of one record are far
+    outside the others, and bands for all hold 72 %."""
+    made = study_at_rest(1)
+    first, second, *others = made.fit
+    found = loop(
+        replace(made, fit=(first, replace(second, response=-second.response), *others)),
+        library=[],
+        sample=False,
+        quick=True,
+        as_stated=True,
+    )
+    assert (found.verdict.kind, found.rounds) == ("unexplained", ())
+    assert found.base.noise_known
+    assert pooled_coverage(found.after.fit) > 0.65
+    narrow = replace(found.after.state, widening=None)
+    assert pooled_coverage(fit_scores(narrow)) < 0.1
 
 
 def test_records_of_two_plants_are_named_beside_what_is_traced():

@@ -58,7 +58,7 @@ def numbers(found):
         "refits": [[(r.added, r.log_bayes_factor, r.left_out) for r in one.refits] for one in found.rounds],
         "optimum": found.after.state.optimum.x.tolist(),
         "covariance": found.after.state.covariance.tolist(),
-        "evidence": found.after.log_evidence,
+        "evidence": found.after.state.log_evidence,
         "errors": [(one.rmse, one.variance.tolist()) for one in scores],
     }
 

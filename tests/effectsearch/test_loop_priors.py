@@ -18,6 +18,7 @@ from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.rounds import _gained
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.effects.catalogue import catalogue
@@ -213,6 +214,23 @@ def test_the_evidence_of_a_wider_prior_is_that_of_the_integral():
     integral = np.log(np.trapezoid(np.exp(density - density.max()), grid)) + density.max()
     before = start.optimum.log_evidence
     assert integral - before == pytest.approx(made.log_bayes_factor - made.paid, abs=0.1)
+
+
+def test_an_effect_is_worth_what_its_refit_is():
+    """The wider prior is paid for in either."""
+    first = looped(1).rounds[0]
+    chosen = first.chosen
+    assert chosen.paid == pytest.approx(-np.log(priorwidth.COMMON))
+    gained, _ = _gained(first.state, chosen.state, chosen.quiet)
+    assert gained == pytest.approx(chosen.log_bayes_factor)
+
+
+def test_sizes_of_effects_are_over_their_default_priors():
+    """As a refit takes them, whose priors are not widened yet."""
+    state = looped(1).after.state
+    ((effect, (size,)),) = state.model.sizes(state.optimum.x)
+    (coefficient,) = effect.coefficients(state.model.effected.ranges)
+    assert size * coefficient.scale == pytest.approx(state.optimum.x[state.model.plant_size])
 
 
 def _marginal(model: ExtendedModel, x: np.ndarray, k: int, at: float, whitening) -> float:

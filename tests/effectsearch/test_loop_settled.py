@@ -15,7 +15,7 @@ from lcopa_bayes.effectsearch.freedconstants import released
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import _beside_others, search
+from lcopa_bayes.effectsearch.rounds import _beside_others, _gained, search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Scale, Signature
 from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
@@ -94,6 +94,15 @@ def test_what_a_length_leaves_open_is_in_every_interval(pulsed):
     assert (end.covariance.diagonal() > 1.05 * end.optimum.covariance.diagonal()).any()
 
 
+def test_an_effect_of_several_instances_is_worth_what_its_refit_is(pulsed):
+    """The choice among the frames of a pulse is paid for in either."""
+    plain, _ = pulsed.without(pulsed.added)
+    gained, _ = _gained(State(plain, pulsed.before, pulsed.whitening), pulsed.state, pulsed.quiet)
+    assert gained == pytest.approx(pulsed.log_bayes_factor)
+    assert pulsed.paid < -2.0
+    assert _gained(pulsed.state, pulsed.state, pulsed.quiet)[0] == 0.0
+
+
 def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
     """By a refit that adds it to the plant with the other."""
     made = study(2, 0.06)
@@ -102,7 +111,7 @@ def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
     one = refit(base.model, base.optimum, base.whitening, [(even, np.zeros(1))], 1e3)
     two = refit(one.model, one.optimum, one.whitening, [(odd, np.zeros(1))], 1e3)
     of_even, of_odd = _beside_others(two.state, 1e3)
-    assert of_odd == pytest.approx(two.log_bayes_factor - two.paid, abs=0.5)
+    assert of_odd == pytest.approx(two.log_bayes_factor, abs=0.5)
     assert of_even < 5 < 30 < of_odd
     assert two.wald("even_curvature") > SIGNIFICANT
 
