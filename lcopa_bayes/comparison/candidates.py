@@ -12,12 +12,26 @@ from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, NoiseSet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.elementterms import terms_in_words
+from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.results.structure import structure_of
 
 STUDY = "study"
 """Name of the candidate that is the study unchanged."""
-KNOWN = (STUDY, "fractional-1", "fractional-2", "fractional-3", "first-order", "second-order", "integer-kept")
+BY_ELEMENT = "fractional-by-element"
+"""Name of the candidate whose elements have as many terms as the records choose."""
+KNOWN = (
+    STUDY,
+    "fractional-1",
+    "fractional-2",
+    "fractional-3",
+    BY_ELEMENT,
+    "first-order",
+    "second-order",
+    "integer-kept",
+)
 """Candidates any study has."""
 VARIANTS: Mapping[str, str] = {
     "separate": "an element of its own for every path",
@@ -48,9 +62,9 @@ class Candidate:
 
     @property
     def integer(self) -> bool:
-        """Whether every order is fixed at an integer."""
-        orders = self.study.model.orders
-        return orders != "free" and all(float(order).is_integer() for order in orders)
+        """Whether every order is fixed at an integer, by the model or by priors."""
+        orders = [row for row in _table(self.study).rows if row.kind == "order"]
+        return all(not row.free and float(row.value).is_integer() for row in orders)
 
     @property
     def terms(self) -> int:
@@ -69,6 +83,8 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
     fractional = re.fullmatch(r"fractional-([1-6])", base)
     if fractional:
         settings["terms"] = int(fractional[1])
+    elif base == BY_ELEMENT:
+        settings["terms"] = "auto"
     elif base == "first-order":
         settings["orders"] = (1.0,)
     elif base == "second-order":
@@ -87,10 +103,16 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
     return CandidateSettings(name, cross="no-cross" not in variants, **settings)  # type: ignore[arg-type]
 
 
-def derived(study: Study, settings: CandidateSettings) -> Candidate:
-    """A candidate of a study; InputError when its settings do not fit the study's axes."""
-    model = settings.model(study.model)
+def derived(study: Study, settings: CandidateSettings, *, jobs: int = 1) -> Candidate:
+    """A candidate of a study; InputError when its settings do not fit the study's axes.
+
+    Terms that the records are to choose are looked for by least squares, in `jobs` processes.
+    """
     notes: list[str] = []
+    if settings.terms == "auto":
+        settings = replace(settings, terms=_chosen_terms(study, settings, jobs))
+        notes.append("has as many terms in each element as the records choose by BIC, by least squares")
+    model = settings.model(study.model)
     fixed: dict[str, PriorSettings] = {}
     if not settings.cross:
         model, fixed = _uncrossed(study, settings.name, model)
@@ -116,7 +138,7 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
             raise InputError(f"candidate {settings.name!r}: no parameter {name!r}{nearest(name, names)}")
         priors.pop(name, None)
         notes.append(
-            f"the prior of {name} is improper, so the evidence is undefined; the other scores are under the "
+            f"has an improper prior of {name}, so its evidence is undefined; its other scores are under the "
             "default prior in its place"
         )
     candidate = replace(candidate, priors=priors | stated | fixed)
@@ -126,21 +148,45 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
     return Candidate(settings.name, candidate, about, tuple(notes), improper)
 
 
+def _chosen_terms(study: Study, settings: CandidateSettings, jobs: int) -> int | Mapping[str, int]:
+    """Viscous terms of the elements of a candidate that the records choose [-], with what its paths share as
+    it says; InputError as `structure_of`."""
+    least = derived(study, replace(settings, terms=1)).study
+    structure = structure_of(
+        replace(least, model=replace(least.model, terms="auto")), sharing=False, jobs=jobs
+    )
+    assert structure is not None
+    terms = structure.chosen.study.model.terms
+    assert terms != "auto"
+    return terms
+
+
 def candidates_of(
-    study: Study, extra: Sequence[CandidateSettings] = (), pick: Sequence[str] | None = None
+    study: Study,
+    extra: Sequence[CandidateSettings] = (),
+    pick: Sequence[str] | None = None,
+    *,
+    chosen: bool = False,
+    jobs: int = 1,
 ) -> tuple[Candidate, ...]:
     """The candidates to compare: those picked by name, or a short list and all of `extra`.
 
-    InputError for a name that is unknown, and when fewer than two different models are left.
+    `chosen` says that the study's numbers of terms are those that its records choose already; those of other
+    candidates are looked for in `jobs` processes. InputError for a name that is unknown, and when fewer than
+    two different models are left.
     """
     own = {one.name: one for one in (*study.candidates, *extra)}
-    wanted = pick if pick is not None else (study.compare.pick or (*_short_list(study), *own))
+    asked = pick if pick is not None else study.compare.pick or None
+    wanted = (*_short_list(study, chosen), *own) if asked is None else asked
     problems: list[str] = []
     candidates: list[Candidate] = []
     for name in dict.fromkeys(wanted):
         try:
-            candidates.append(derived(study, own[name] if name in own else known_settings(name, study)))
+            settings = own[name] if name in own else known_settings(name, study)
+            candidates.append(derived(study, settings, jobs=jobs))
         except InputError as error:
+            if asked is None and name == BY_ELEMENT:  # what is wrong with the study, the others say
+                continue
             problems += [f"candidate {name!r}: {p}" if name not in p else p for p in error.problems]
     refuse_if(problems)
     distinct: list[Candidate] = []
@@ -168,7 +214,7 @@ def of_studies(studies: Sequence[Study], fits: Sequence[Predictive | None]) -> t
     )
 
 
-def _short_list(study: Study) -> list[str]:
+def _short_list(study: Study, chosen: bool) -> list[str]:
     """A few candidates that ask how many terms, and whether fractional ones."""
     model, most = study.model, study.model.most_terms
     if study.effects.use:
@@ -179,6 +225,8 @@ def _short_list(study: Study) -> list[str]:
     fractional = [f"fractional-{terms}" for terms in range(1, upto + 1)]
     if len(study.drive_axes) != len(study.response_axes):  # do its paths have anything in common?
         fractional.insert(1, "fractional-1-shared")
+    if len(_layout(study, model).elements) > 1 and not chosen:
+        fractional.append(BY_ELEMENT)
     return [*own, *fractional, *(["first-order"] if most <= 2 and not own else []), "second-order"]
 
 
@@ -194,9 +242,16 @@ def _same(one: Candidate, other: Candidate) -> bool:
 
 def _names(study: Study) -> tuple[str, ...]:
     """Names of the parameters a study without priors of its own has."""
-    layout = Layout.of(study.drive_axes, study.response_axes, study.model)
-    names = table_of(study, layout, Scales.of(study.fit))[2].names
+    names = _table(study).names
     return (*names, *{name.partition("[")[0] for name in names if "[" in name})
+
+
+def _table(study: Study) -> ParameterTable:
+    return table_of(study, _layout(study, study.model), Scales.of(study.fit))[2]
+
+
+def _layout(study: Study, model: ModelSettings) -> Layout:
+    return Layout.of(study.drive_axes, study.response_axes, model)
 
 
 def _uncrossed(
@@ -211,7 +266,7 @@ def _uncrossed(
         )
     if model.share == "paper":  # the direct paths' element is then the only one
         model = replace(model, share="all", terms=_direct_terms(model))
-    layout = Layout.of(study.drive_axes, study.response_axes, model)
+    layout = _layout(study, model)
     direct = {(layout.own_response(j), j) for j in range(axes[1])}
     used = {layout.element_of[i][j] for i, j in direct if i is not None}
     delays = {layout.delay_of[i][j] for i, j in direct if i is not None}
@@ -236,10 +291,7 @@ def _direct_terms(model: ModelSettings) -> int:
 
 
 def _about(study: Study, model: ModelSettings, cross: bool) -> str:
-    if isinstance(model.terms, Mapping):
-        terms = ", ".join(f"{name} {count}" for name, count in model.terms.items()) + " terms"
-    else:
-        terms = f"{model.most_terms} term{'s' if model.most_terms > 1 else ''}"
+    terms = terms_in_words(_layout(study, model).terms)
     orders = (
         "free orders"
         if model.orders == "free"

@@ -18,6 +18,7 @@ from lcopa_bayes.comparison.averaging import (
 )
 from lcopa_bayes.comparison.priorwidth import FACTORS
 from lcopa_bayes.core.wording import joined
+from lcopa_bayes.results.residuals import WHITE_P
 
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:
@@ -129,8 +130,6 @@ def undecided(why: str) -> dict[str, Any]:
 
 RESONANT = 1.5
 """Order from which a single term overshoots visibly [-]."""
-NOT_WHITE = 0.01
-"""p-value below which a whitened residual is not white [-]."""
 
 
 def decided(rows: Sequence[Row]) -> dict[str, Any]:
@@ -247,7 +246,7 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
             continue
         left = [one for one in row["residual_tests"] if not one["held_out"]]
         worst = min(left, key=lambda one: one["p_white"], default=None)
-        if worst is None or worst["p_white"] >= NOT_WHITE:
+        if worst is None or len(left) * worst["p_white"] >= WHITE_P:  # corrected for all that are tested
             continue
         high = [one["estimate"] for one in row["order_is_integer"] if one["estimate"]["lower"] > RESONANT]
         said = (

@@ -272,8 +272,9 @@ class CandidateSettings(Ruled):
 
     name: Annotated[str, FOLDER]
     """Also the name of the candidate's folder."""
-    terms: Annotated[int | Mapping[str, int] | None, _TERMS] = None
-    """Viscous terms [-]; None: as many as `orders`, else those of the study."""
+    terms: Annotated[int | Literal["auto"] | Mapping[str, int] | None, _TERMS] = None
+    """Viscous terms [-]; "auto": of each element as many as the records choose; None: as many as `orders`,
+    else those of the study."""
     orders: Annotated[Literal["free"] | tuple[float, ...] | None, _ORDERS] = None
     """Orders [-]; None: free where `terms` is given, else those of the study."""
     share: Share | None = None

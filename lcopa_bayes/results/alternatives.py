@@ -37,7 +37,7 @@ from lcopa_bayes.results.sumsoflags import (
     weight_in,
     weights_of,
 )
-from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Limitation
+from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Grade, Limitation
 
 _MOVED = 0.5
 """Shift of a median over its standard deviation from which a number counts as moved [-] ..."""
@@ -219,7 +219,8 @@ def _numbers(fitted: Fit, found: Sequence[Alternative], integer: IntegerFit | No
     if found:
         values["lags"] = lag_figures(found, fitted.curves.time, unit)
         ess += [one.draws.ess for one in found]
-    grade = fitted.draws.grade.level if min(ess) >= TENTATIVE_ESS else "tentative"
+    few = [] if min(ess) >= TENTATIVE_ESS else [Grade("tentative", "")]
+    grade = Grade.worst([fitted.draws.grade, *few]).level
     share = integer.weight if integer else 0.0
     named = {kind: {one.name: one for one in own} for kind, own in values.items()}
     out = []

@@ -118,9 +118,11 @@ class Structure:
         return plain({"chosen": self.chosen.name, "candidates": rows, "sentence": self.sentence})
 
 
-def structure_of(study: Study, *, jobs: int = 1, quiet: bool = True) -> Structure | None:
-    """The structure of a study whose terms are "auto"; None where it states them. Unless `quiet`, it is said
-    what is looked at.
+def structure_of(
+    study: Study, *, sharing: bool = True, jobs: int = 1, quiet: bool = True
+) -> Structure | None:
+    """The structure of a study whose terms are "auto"; None where it states them. Without `sharing`, what
+    paths share is as the study says. Unless `quiet`, it is said what is looked at.
 
     InputError as `first_look` of the fewest terms, and for priors that no number of terms has a use for.
     """
@@ -134,7 +136,8 @@ def structure_of(study: Study, *, jobs: int = 1, quiet: bool = True) -> Structur
         while True:
             bar.update()
             best = Structure(tuple(looked)).chosen.study.model
-            model = next((one for one in _beside(best, least) if one not in tried), None)
+            beside = _beside(best, least, sharing=sharing)
+            model = next((one for one in beside if one not in tried), None)
             if model is None:
                 return Structure((*looked, *_by_element(looked, jobs)))
             tried.append(model)
@@ -180,11 +183,11 @@ def _with_fewer(one: Looked, smaller: Looked, element: str) -> tuple[Problem, Ve
     return problem, start, float(problem.posterior.joint_log_likelihood(start[None])[0])
 
 
-def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:
-    """Structures one step from another: more or less is shared than paths do from the start, a term more or
-    less."""
+def _beside(model: ModelSettings, least: Study, *, sharing: bool) -> Iterator[ModelSettings]:
+    """Structures one step from another: more or less is shared than paths do from the start, where `sharing`
+    is asked for, a term more or less."""
     own = least.model
-    if len(least.drive_axes) * len(least.response_axes) > 1:
+    if sharing and len(least.drive_axes) * len(least.response_axes) > 1:
         yield replace(model, share="none" if model.share == own.share else own.share)
         yield replace(model, delay="path" if model.delay == own.delay else own.delay)
     terms = model.most_terms

@@ -85,14 +85,21 @@ def compare(
         if candidates or described:
             raise InputError("several studies are the candidates; `--pick` and `--candidates` are of one")
         fits = [finished(source) for source in sources]
-        models = of_studies([study_of(source) for source in sources], fits)
+        models = of_studies([settled(study_of(source), jobs=jobs) for source in sources], fits)
     else:
         named = isinstance(described, Path | str)
-        chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        single = settled(study_of(study), jobs=jobs)  # type: ignore[arg-type]
+        picked, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
+        asked = study_of(study)  # type: ignore[arg-type]
+        single = settled(asked, jobs=jobs)
         if single.effects.use:  # its candidates have them or not, but never without their priors
             problem_of(single)
-        models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]
+        models = candidates_of(
+            single,
+            more,  # type: ignore[arg-type]
+            candidates or picked,
+            chosen=single is not asked,
+            jobs=jobs,
+        )
     origin = plain(provenance(models[0].study, "compare"))
     with (
         TemporaryDirectory() if folder is None else nullcontext(str(folder)) as place,

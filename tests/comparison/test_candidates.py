@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-import pytest
-from small import TWO, record, study
+from collections.abc import Sequence
+from dataclasses import replace
 
-from lcopa_bayes.comparison.candidates import Candidate, candidates_of, derived, known_settings
+import pytest
+from small import TWO, path, record, study
+
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.comparison.candidatefit import contender
+from lcopa_bayes.comparison.candidates import BY_ELEMENT, Candidate, candidates_of, derived, known_settings
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import CandidateSettings, PriorSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.verbs.compare import compare as compared
 
 
 def named(one: Candidate) -> tuple[str, ...]:
@@ -41,6 +50,95 @@ def test_a_study_with_terms_by_element_stands_for_itself():
     assert [one.name for one in found] == ["study", "fractional-1", "fractional-2", "second-order"]
     assert found[0].study.model == own.model
     assert [one.terms for one in found] == [3, 1, 2, 2]
+
+
+def ring_and_lag(**model: object) -> Study:
+    """The first response rings and creeps, the second is a lag."""
+    paths = ((path(1.0, 0.5, (1.0, 2.0), (1.9, 0.7)),), (path(1.0, 0.5, (1.5,), (0.9,)),))
+    device = Device(paths, (Axis("u", "V"),), TWO.response_axes, (0.0, 0.0))
+    move = on_off(1.0, hold=9.0, at=0.5)
+    return study(
+        record(device=device, command=move, camera=0.25, duration=20.0, noise_sd=0.004),
+        **{"terms": 1} | model,
+    )
+
+
+def test_terms_that_the_records_choose_for_each_element_are_a_candidate():
+    own = ring_and_lag()
+    found = {one.name: one for one in candidates_of(own)}
+    one = found[BY_ELEMENT]
+    assert one.study.model.terms == {"x_u": 2, "y_u": 1}
+    assert one.about.startswith("2 terms in x_u, and 1 in the others, free orders")
+    assert one.notes == ("has as many terms in each element as the records choose by BIC, by least squares",)
+    equal = problem_of(found["fractional-2"].study).posterior.table
+    assert set(named(one)) == set(equal.names) - {"time_2_y_u", "order_2_y_u"}
+    # described with "auto" it is the same model, which --resume recognises
+    again = derived(own, CandidateSettings("own", terms="auto"))
+    prints = {contender(each, None, quick=False, resume=True).fingerprint for each in (one, again)}
+    assert len(prints) == 1
+
+
+def test_terms_are_chosen_with_what_the_paths_of_a_candidate_share():
+    """Of one element there is one number; chosen numbers that are equal are no candidate of their own."""
+    own = ring_and_lag()
+    shared = made(f"{BY_ELEMENT}-shared", own).study.model
+    assert (shared.share, shared.delay) == ("all", "shared")
+    assert isinstance(shared.terms, int)
+    alike = study(record(device=TWO, camera=0.5, noise_sd=0.3))
+    with pytest.raises(InputError, match="1 candidate left"):
+        candidates_of(alike, pick=[BY_ELEMENT, "fractional-1"])
+
+
+def test_terms_are_not_looked_for_where_they_are_known_or_there_is_one_element(monkeypatch):
+    monkeypatch.setattr("lcopa_bayes.comparison.candidates.structure_of", None)
+    plain = ["fractional-1", "fractional-1-shared", "fractional-2", "first-order", "second-order"]
+    assert [one.name for one in candidates_of(ring_and_lag(), chosen=True)] == plain
+    assert BY_ELEMENT not in [one.name for one in candidates_of(ring_and_lag(share="all"))]
+    assert BY_ELEMENT not in [one.name for one in candidates_of(study(record()))]
+
+
+def test_a_short_list_does_without_terms_that_cannot_be_chosen(monkeypatch):
+    def refused(*_: object, **__: object) -> None:
+        raise InputError("no search leads to a plant")
+
+    monkeypatch.setattr("lcopa_bayes.comparison.candidates.structure_of", refused)
+    assert BY_ELEMENT not in [one.name for one in candidates_of(ring_and_lag())]
+    with pytest.raises(InputError, match=f"candidate '{BY_ELEMENT}': no search"):
+        candidates_of(ring_and_lag(), pick=[BY_ELEMENT, "fractional-1"])
+
+
+def candidates_taken(monkeypatch, source: Study | Sequence[Study]) -> list[Candidate]:
+    """What the verb compares."""
+    taken: list[Candidate] = []
+
+    def noted(models: Sequence[Candidate], **_: object) -> None:
+        taken.extend(models)
+        raise InputError("enough is known")
+
+    monkeypatch.setattr("lcopa_bayes.verbs.compare.compared", noted)
+    with pytest.raises(InputError, match="enough is known"):
+        compared(source)
+    return taken
+
+
+def test_studies_that_leave_their_terms_to_the_records_are_settled_before_they_are_compared(monkeypatch):
+    several = [study(record(), terms=terms) for terms in ("auto", 2)]
+    assert [one.study.model.terms for one in candidates_taken(monkeypatch, several)] == [1, 2]
+
+
+def test_a_study_whose_records_have_chosen_is_not_searched_again(monkeypatch):
+    own = ring_and_lag(terms="auto")
+    settled = replace(own, model=replace(own.model, terms=2))
+    monkeypatch.setattr("lcopa_bayes.verbs.compare.settled", lambda *_, **__: settled)
+    monkeypatch.setattr("lcopa_bayes.comparison.candidates.structure_of", None)
+    assert "fractional-2" in [one.name for one in candidates_taken(monkeypatch, own)]
+
+
+def test_orders_that_priors_hold_at_integers_are_integer_orders():
+    held = study(record(), terms=2, priors={"order_1": 2.0, "order_2": 1.0})
+    assert made("study", held).integer
+    assert not made("study", study(record(), terms=2, priors={"order_1": 2.0})).integer
+    assert not made("study", study(record(), priors={"order_1": 0.5})).integer
 
 
 def test_integer_candidates_have_integer_orders():
@@ -112,7 +210,7 @@ def test_a_file_adds_and_picks(tmp_path):
     assert slow.table.rows[slow.table.names.index("delay")].value == 0.5
     assert found[2].improper == ("gain",)
     assert not found[2].integer
-    assert "undefined" in found[2].notes[0]
+    assert found[2].notes[0].startswith("has an improper prior of gain, so its evidence is undefined")
 
 
 @pytest.mark.parametrize(

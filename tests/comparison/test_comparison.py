@@ -423,6 +423,14 @@ def test_a_high_order_over_a_residual_that_is_not_white_is_flagged():
     assert [(flag["model"], flag["kind"]) for flag in flags] == [("one", "imitation")]
 
 
+def test_a_residual_is_held_against_all_that_are_tested():
+    left = [{"record": "a", "axis": f"y{k}", "held_out": False, "p_white": 0.9} for k in range(9)]
+    for p, flagged in ((0.005, []), (0.0005, ["one"])):
+        one = card("one", 0.0, 0.0, residual_tests=[*left, left[0] | {"p_white": p}])
+        flags = decided(judged_rows(one, card("two", 0.0, 0.0)))["flags"]
+        assert [flag["model"] for flag in flags] == flagged
+
+
 def judged_rows(*cards: dict) -> list[dict]:
     totals = {"elpd": 0.0, "elpd_monte_carlo_sd": 0.0, "held_out_rmse": {}}
     return [one | totals for one in cards]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,16 @@ def test_a_better_sum_of_lags_limits_every_number(beside: Fit) -> None:
     reported = {one.name: one for one in beside.metrics}["delay[y]"]
     assert reported.lower <= DELAY <= reported.upper
     assert "of sums of lags" in reported.note
+
+
+def test_figures_over_lags_are_no_better_than_the_fit(short: Fit) -> None:
+    """Few effective draws make a number tentative at best, not what is unusable anyway."""
+    few = tuple(replace(one, ess_bulk=50.0) for one in short.draws.qualities)
+    poor = replace(short, draws=replace(short.draws, qualities=few))
+    assert poor.draws.grade.level == "unusable"
+    graded = with_alternatives(poor, None).alternatives
+    assert graded is not None
+    assert {one.estimate.grade for one in graded.numbers} == {"unusable"}
 
 
 @pytest.fixture(scope="module")
