@@ -305,17 +305,16 @@ def _roles(
     lacking = [role for role, each in roles.items() if not each]
     usable = [name for name, column in columns.items() if column.numeric and column.moves]
     free = [name for name in usable if name not in taken]
-    remedy = "name one with --{}, one of " + ", ".join(map(repr, free))
-    if len(usable) < 2 or not free:
-        known = f"only {usable[0]!r} holds" if len(usable) == 1 else "no other column holds"
-        remedy = (
-            f"besides the time {known} numbers that change; a record needs a drive that changes, and its "
-            "response"
-        )
-    refuse_if(
-        problems
-        + [f"{table.where}: no column is recognised as a {role}; {remedy.format(role)}" for role in lacking]
-    )
+    known = f"only {usable[0]!r} holds" if len(usable) == 1 else "no other column holds"
+    for role in lacking:
+        remedy = f"name one with --{role}, one of {', '.join(map(repr, free))}"
+        if len(usable) < 2 or not free:
+            remedy = (
+                f"besides the time {known} numbers that change; a record needs a drive that changes, and "
+            )
+            remedy += "its response"
+        problems.append(f"{table.where}: no column is recognised as a {role}; {remedy}")
+    refuse_if(problems)
     return roles["drive"], roles["response"]
 
 

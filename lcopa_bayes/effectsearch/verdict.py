@@ -208,8 +208,7 @@ def decide(given: Findings) -> Verdict:
         said += f", but {perhaps}not all that is, worth {given.gained:.0f} nat{together}."
         return Verdict("partly explained", "tentative", said + rest)
     rest = rest or " Nothing significant remains."
-    if missed is not None and missed.far:
-        confidence = "tentative"
+    if missed is not None and missed.far:  # says nothing of the name
         rest += f" But {missed.said}."
     if set(given.effects) <= set(given.disturbances):
         verb = "disturbs" if one else "disturb"

@@ -169,6 +169,12 @@ def test_a_table_without_a_drive_is_not_told_to_name_its_response(tmp_path):
     (tmp_path / "x.csv").write_text("Time [s],u,y\n0,1,1\n1,1,2\n2,1,4\n3,1,5")
     with pytest.raises(InputError, match="only 'y' holds numbers that change; a record needs a drive that"):
         read(tmp_path / "x.csv")
+    (tmp_path / "y.csv").write_text("Time [s],{u,y{0}\n0,1,1\n1,1,1\n2,1,1\n3,1,1")
+    with pytest.raises(InputError, match="no other column holds numbers that change"):
+        read(tmp_path / "y.csv")
+    (tmp_path / "z.csv").write_text("Time [s],y,{b\n0,1,3\n1,3,1\n2,2,2\n3,5,7")
+    with pytest.raises(InputError, match=r"name one with --drive, one of 'y', '\{b'"):
+        read(tmp_path / "z.csv")
 
 
 def test_a_formula_without_a_stored_result_is_named_by_its_cell(tmp_path):

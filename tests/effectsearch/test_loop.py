@@ -441,7 +441,7 @@ def test_a_verdict_says_given_what_held_out_records_were_judged():
 
 
 def test_what_chance_may_explain_is_said_beside_a_name():
-    """And takes the firmness of the verdict, as beside `clean`; above 1.1 times the noise no name is all."""
+    """It does not doubt the name; but above 1.1 times the noise no name is all."""
     above = decide(replace(FOUND, reached=1.12, missed=Miss("y", 1.12, 0.88, 0.3)))
     assert (above.kind, above.confidence) == ("partly explained", "tentative")
     assert "but perhaps not all that is" in above.sentence
@@ -450,11 +450,12 @@ def test_what_chance_may_explain_is_said_beside_a_name():
     assert "but not all that is" in left.sentence
     assert "chance" not in left.sentence
     uncovered = decide(replace(FOUND, missed=Miss("y", 1.0, 0.8, 0.3)))
-    assert (uncovered.kind, uncovered.confidence) == ("explained", "tentative")
+    assert (uncovered.kind, uncovered.confidence) == ("explained", "firm")
     assert "(by chance with probability 0.3)" in uncovered.sentence
     disturbed = decide(replace(FOUND, disturbances=("a",), missed=Miss("y", 1.0, 0.8, 0.3)))
-    assert (disturbed.kind, disturbed.confidence) == ("disturbance", "tentative")
-    assert decide(replace(FOUND, missed=Miss("y", 1.0, 0.9, 0.3))).confidence == "firm"
+    assert (disturbed.kind, disturbed.confidence) == ("disturbance", "firm")
+    assert "by chance" in disturbed.sentence
+    assert "chance" not in decide(replace(FOUND, missed=Miss("y", 1.0, 0.9, 0.3))).sentence
 
 
 def test_something_that_is_missing_is_not_said_to_be_nothing():
