@@ -309,10 +309,8 @@ def _roles(
     for role in lacking:
         remedy = f"name one with --{role}, one of {', '.join(map(repr, free))}"
         if len(usable) < 2 or not free:
-            remedy = (
-                f"besides the time {known} numbers that change; a record needs a drive that changes, and "
-            )
-            remedy += "its response"
+            needed = "a record needs a drive that changes, and its response"
+            remedy = f"besides the time {known} numbers that change; {needed}"
         problems.append(f"{table.where}: no column is recognised as a {role}; {remedy}")
     refuse_if(problems)
     return roles["drive"], roles["response"]

@@ -53,8 +53,7 @@ def read_spreadsheet(path: Path, *, sheet: str | None = None) -> CellTable:
     """The cells of a table as text under their headers, units in brackets behind them.
 
     `sheet` names the sheet of a workbook, by default the first with a table of three columns or more, else of
-    two. InputError when
-    there is no such file or sheet, it cannot be read, or it holds no table.
+    two. InputError when there is no such file or sheet, it cannot be read, or it holds no table.
     """
     path = Path(path)
     if path.is_dir():

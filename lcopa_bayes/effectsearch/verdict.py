@@ -202,7 +202,7 @@ def decide(given: Findings) -> Verdict:
                 perhaps = "perhaps "
                 rest += f", which chance gives with probability {missed.p:.2g}"
             rest += "."
-        elif missed is not None:
+        elif missed is not None and missed.significant:
             rest += f" But {missed.said}."
         together = "" if one and not given.dynamics else " together"
         said += f", but {perhaps}not all that is, worth {given.gained:.0f} nat{together}."

@@ -446,6 +446,10 @@ def test_what_chance_may_explain_is_said_beside_a_name():
     assert (above.kind, above.confidence) == ("partly explained", "tentative")
     assert "but perhaps not all that is" in above.sentence
     assert "1.12 times the noise, which chance gives with probability 0.3." in above.sentence
+    linear = decide(replace(FOUND, dynamics=True, missed=Miss("y", 1.0, 0.9, 0.5))).sentence
+    assert linear.endswith(
+        "Linear dynamics without a name are missing too."
+    )  # errors as of noise say nothing
     left = decide(replace(FOUND, reached=1.12, missed=Miss("y", 1.12, 0.88, 0.3), remaining=4.0, share=0.96))
     assert "but not all that is" in left.sentence
     assert "chance" not in left.sentence
