@@ -26,7 +26,7 @@ Texts: TypeAlias = Sequence[str] | np.ndarray[Any, Any]
 """Cells of a column, (n,), text where they are an array."""
 CHUNK = 10_000
 """Rows held as lists of objects at a time: a cell takes 100 bytes there, and 16 in an array."""
-_MOST = 5
+NAMED = 5
 """Problems named per column, so that one shifted column does not bury the others."""
 
 
@@ -60,9 +60,9 @@ class CellTable:
 
     def add(self, problems: Sequence[str], place: str) -> None:
         """Add the first problems of a kind and the number of the others."""
-        self.problems.extend(problems[:_MOST])
-        if len(problems) > _MOST:
-            self.problems.append(f"{place}: and {len(problems) - _MOST} more like these")
+        self.problems.extend(problems[:NAMED])
+        if len(problems) > NAMED:
+            self.problems.append(f"{place}: and {len(problems) - NAMED} more like these")
 
 
 def refuse(path: Path, why: str) -> NoReturn:

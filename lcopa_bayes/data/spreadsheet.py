@@ -25,7 +25,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
-from lcopa_bayes.data.cells import TEXTS, CellTable, Texts, packed, read_cells
+from lcopa_bayes.data.cells import NAMED, TEXTS, CellTable, Texts, packed, read_cells
 
 WORKBOOKS = (".xlsx", ".xlsm")
 """Suffixes of spreadsheets; anything else is text."""
@@ -43,8 +43,6 @@ _WRITTEN_FORMULA = re.compile(rb"<(\w+:)?f[\s/>]")
 """A formula in a part of a workbook."""
 _FEWEST = 3
 """Columns of a table, fewest: time, drive and response."""
-_NAMED = 5
-"""Most cells that a message names."""
 _HEADED = 40
 """Most lines in which a header is looked for."""
 
@@ -126,7 +124,7 @@ def _workbook(path: Path, sheet: str | None) -> CellTable:
         name = next(named, next(iter(tables), None))
         if name is not None:
             if _has_formulas(path):
-                refuse_if(list(islice(_open_formulas(path, name), _NAMED)))
+                refuse_if(list(islice(_open_formulas(path, name), NAMED)))
             width = max(len(cells) for _, cells in heads[name])  # a column may have no name
             whole = ((n, [*cells, *[""] * (width - len(cells))]) for n, cells in _texts(path, book[name]))
             return _tabled(path, whole, sheet=name if len(book.sheetnames) > 1 else "")

@@ -12,7 +12,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.data.cells import CHUNK, CellTable, Texts
+from lcopa_bayes.data.cells import CHUNK, NAMED, CellTable, Texts
 
 _DATES = (
     *("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d/%m/%y", "%m/%d/%y"),
@@ -24,8 +24,6 @@ _FORMATS = (*(f"{date} {clock}" for date, clock in product(_DATES, _CLOCKS)), _Z
 _ELAPSED = r"(\d+):([0-5]\d):([0-5]\d\.\d+)"
 """Hours, which may be more than 24, minutes and seconds."""
 _DAY = 86_400.0
-_NAMED = 5
-"""Most cells that a message names."""
 
 
 def seconds(table: CellTable, column: str, cells: Texts, stated: str = "") -> Vector:
@@ -97,7 +95,7 @@ def _unlike(
     return [
         f"{table.place(at, int(row))}: {cells[row]!r} is not a time in {known}; write all times alike, or "
         "state their format with --time-format, such as %d.%m.%Y %H:%M:%S"
-        for row in np.flatnonzero(parsed.isna())[:_NAMED]
+        for row in np.flatnonzero(parsed.isna())[:NAMED]
     ]
 
 

@@ -309,10 +309,8 @@ def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | N
     larger = richer.state if richer else wider.start
     same = Regression(smaller.model, larger.whitening).descend(smaller.optimum.x)
     ordering = wider.fit.model.plant.table.log_support - base.fit.model.plant.table.log_support
-    own, theirs = (
-        paid(one.model, [effect.name for effect in one.model.effects]) for one in (larger, smaller)
-    )
-    return log_bayes_factor(same, larger.optimum, quiet) + ordering + own - theirs
+    ordering += paid(larger.model) - paid(smaller.model)
+    return log_bayes_factor(same, larger.optimum, quiet) + ordering
 
 
 def _named(

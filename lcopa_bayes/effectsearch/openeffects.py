@@ -27,8 +27,7 @@ from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, signature_of
-from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
-from lcopa_bayes.effectsearch.trace import Trace
+from lcopa_bayes.effectsearch.trace import Trace, worth
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
 from lcopa_bayes.results.averages import parts_of_sd, pooled
@@ -187,10 +186,9 @@ def step_figures(
 def odds(seen: Trace, log_bayes_factor: float) -> float:
     """Of one more effect against none [-]: as probable beforehand as any other, and all together as none.
 
-    Its evidence counts in what chance gives: where that is more than under noise that is known, by as much
-    less. Of more than `_CERTAIN` nat as of these, so that weights can be added up.
+    By what its evidence is worth, of more than `_CERTAIN` nat as of these, so that weights can be added up.
     """
-    exponent = min(log_bayes_factor * CHANCE / seen.threshold, _CERTAIN)
+    exponent = min(worth(log_bayes_factor, seen.threshold), _CERTAIN)
     return float(np.exp(exponent)) / len(seen.traced)
 
 

@@ -291,9 +291,10 @@ def under_one_noise(candidates: Sequence[Refit]) -> list[Refit]:
     return sorted(candidates, key=lambda one: -one.log_bayes_factor)
 
 
-def paid(model: ExtendedModel, names: Collection[str]) -> float:
-    """Evidence of known signs of coefficients of effects `names` of a model, less that of the choice among
-    their instances and of priors wider than the default ones [nat]."""
+def paid(model: ExtendedModel, names: Collection[str] | None = None) -> float:
+    """Evidence of known signs of coefficients of effects `names` of a model, by default of all, less that of
+    the choice among their instances and of priors wider than the default ones [nat]."""
+    names = [effect.name for effect in model.effects] if names is None else names
     out = -rarity(model, names)
     for effect in model.effects:
         if effect.name in names:

@@ -275,8 +275,7 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     plain = start.optimum
     if state.whitening is not start.whitening:
         plain = Regression(start.model, state.whitening).descend(start.optimum.x)
-    own, had = (paid(one.model, [effect.name for effect in one.model.effects]) for one in (state, start))
-    gained = log_bayes_factor(plain, state.optimum, quiet) + own - had
+    gained = log_bayes_factor(plain, state.optimum, quiet) + paid(state.model) - paid(start.model)
     return gained, plain.cost - state.optimum.cost
 
 

@@ -40,6 +40,11 @@ SEEN = 0.1
 """Below this survival the records cannot see an effect [-]."""
 
 
+def worth(log_bayes_factor: float, threshold: float) -> float:
+    """Evidence in what chance gives: where that is more than under known noise, by as much less [nat]."""
+    return log_bayes_factor * LEAST / threshold
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Traced:
@@ -124,10 +129,12 @@ class Trace:
 
     @cached_property
     def probabilities(self) -> dict[str, float]:
-        """Posterior probability of each effect and of "none", if exactly one of them is there [-]. Evidence
-        counts in what chance gives, as it does for a verdict (`openeffects.odds`)."""
-        share, worth = np.log((1 - _NONE) / max(len(self.traced), 1)), LEAST / self.threshold
-        logs = np.array([np.log(_NONE), *(worth * one.log_bayes_factor + share for one in self.traced)])
+        """Posterior probability of each effect and of "none", if exactly one of them is there, by what their
+        evidence is worth [-]."""
+        share = np.log((1 - _NONE) / max(len(self.traced), 1))
+        logs = np.array(
+            [np.log(_NONE), *(worth(one.log_bayes_factor, self.threshold) + share for one in self.traced)]
+        )
         chances = np.exp(logs - logsumexp(logs))
         return dict(zip(("none", *(one.name for one in self.traced)), chances.tolist(), strict=True))
 

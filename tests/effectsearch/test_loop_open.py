@@ -15,9 +15,10 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.noise import Law
-from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds
+from lcopa_bayes.effectsearch.openeffects import Alternative, _step, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
+from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.model.effects.commands import OverdrivePulse
 from lcopa_bayes.model.effects.sensor import SensorLag
