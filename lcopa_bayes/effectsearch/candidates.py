@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
+from typing import TypeAlias
 
 import numpy as np
 
@@ -42,10 +44,12 @@ refit does not double it."""
 _OTHER = 0.9
 """Cosine between signatures below which an instance of an effect is another [-]."""
 _GLANCE, _FOLLOWED, _STEPS = 3, 8, 12
-"""Evaluations from every start, starts that are followed further, those that led lowest, and evaluations from
-these [-]: about half as many as all from every start, and of five sets of records the same refits."""
+"""Evaluations from every start, starts that are followed further, and evaluations from these [-]: about half
+as many as all from every start, and of five sets of records the same refits."""
 _SIZES = (1.0, -1.0)
 """Coefficients from which a single one is also started, with fitted and with integer orders [prior sd]."""
+Start: TypeAlias = tuple[float, Effect, Vector]
+"""Cost of the whole model [nat], the effect and the coordinates."""
 _TEMPERATURES = ("K", "degC", "mK", "degF")
 
 
@@ -175,22 +179,37 @@ def descended(state: State, seen: Trace, traced: Traced) -> tuple[Effect, Vector
     dynamics = traced.card.dynamics
     forced = dynamics or any(isinstance(effect, ForceEffect) for effect in state.model.effects)
     listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))
-    looked: list[tuple[float, Effect, Vector]] = []
-    for signature in listed[: _FORCED if forced else _INSTANCES]:
-        starts = _starts(state, signature, seen, forced=forced)
-        looked += _reached(state, signature.effect, starts, _STEPS if forced else _GLANCE, exact=not forced)
-    looked.sort(key=lambda one: one[0])
+    most, exact = (_STEPS, False) if forced else (_GLANCE, True)
+    instances = [
+        _reached(state, one.effect, _starts(state, one, seen, forced=forced), most, exact=exact)
+        for one in listed[: _FORCED if forced else _INSTANCES]
+    ]
+    ends = by_turns(instances)
     if not forced:
-        further = looked[:_FOLLOWED]
-        looked = [end for _, effect, x in further for end in _reached(state, effect, [x], _STEPS)]
-    if not looked:
+        further = ends[:_FOLLOWED]
+        ends = [end for _, effect, x in further for end in _reached(state, effect, [x], _STEPS)]
+    if not ends:
         raise FloatingPointError(f"{traced.name}: no instance has a bounded response")
-    return min(looked, key=lambda one: one[0])[1:]
+    return min(ends, key=_cost)[1:]
+
+
+def by_turns(instances: Sequence[Sequence[Start]]) -> list[Start]:
+    """Starts of several instances: the lowest of each, by rising cost, then the second of each, and so on.
+
+    The starts of one instance mostly lead to one minimum: the eight lowest of all were those of three frames
+    of a pulse, and the frame that explains the record was a fourth.
+    """
+    turns = zip_longest(*(sorted(starts, key=_cost) for starts in instances))
+    return [start for turn in turns for start in sorted(filter(None, turn), key=_cost)]
+
+
+def _cost(start: Start) -> float:
+    return start[0]
 
 
 def _reached(
     state: State, effect: Effect, starts: Sequence[Vector], most: int, *, exact: bool = True
-) -> list[tuple[float, Effect, Vector]]:
+) -> list[Start]:
     """Cost after so many evaluations [nat], the effect and coordinates, of each start with a bounded
     response."""
     model, out = replace(state.model.having(*state.model.effects, effect), exact=exact), []
