@@ -311,3 +311,15 @@ def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
     volume = (after.log_evidence + after.cost) - (before.log_evidence + before.cost)
     known = Scale(quiet, after.effective - after.x.size, np.array([2 * before.cost]))
     return float(volume + known.gain(np.array([before.cost - after.cost]))[0])
+
+
+def evidence_over(start: State, state: State, quiet: float) -> tuple[float, float]:
+    """Log evidence over the base model's under one whitening, that of the final noise [nat], and the drop of
+    half the residual power [-]."""
+    if not state.model.effects:
+        return 0.0, 0.0
+    plain = start.optimum
+    if state.whitening is not start.whitening:
+        plain = Regression(start.model, state.whitening).descend(start.optimum.x)
+    gained = log_bayes_factor(plain, state.optimum, quiet) + paid(state.model) - paid(start.model)
+    return gained, plain.cost - state.optimum.cost

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Self, final
 
 import numpy as np
 
 from lcopa_bayes.core.crew import ALONE, Crew
-from lcopa_bayes.effectsearch.acceptance import acceptable, accepted, beside_dynamics, large, leader
+from lcopa_bayes.effectsearch.acceptance import accepted, beside_dynamics, large, leader
 from lcopa_bayes.effectsearch.basefit import settled
 from lcopa_bayes.effectsearch.candidates import refitted
+from lcopa_bayes.effectsearch.effectpairs import both, paired
 from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
     Refit,
+    evidence_over,
     log_bayes_factor,
     paid,
-    refit,
-    under_one_noise,
     without,
 )
 from lcopa_bayes.effectsearch.regression import Regression
@@ -27,7 +26,6 @@ from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import (
     Projection,
     expected_margin,
-    pair_evidence,
     signature_of,
 )
 from lcopa_bayes.effectsearch.trace import Trace, trace
@@ -36,10 +34,6 @@ from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
 """Effects that are added at most [-]."""
-_PAIRED = 8
-"""Single effects of which pairs are formed [-]."""
-_PAIRS = 2
-"""Pairs refitted [-]."""
 _STEPS = 3
 """Steps to deflections that a plant fitted with them has [-]: where one was wrong by a fifth each leaves a
 third of the error."""
@@ -120,10 +114,12 @@ class Search:
         start, state, last = rounds[0].state, rounds[-1].state, rounds[-1]
         confounded = (groups.get(effect.name, (effect.name,)) for effect in state.model.effects)
         scale = last.trace.scale
-        gained, dropped = _gained(start, state, scale.quiet)
+        gained, dropped = evidence_over(start, state, scale.quiet)
         left = scale.drop(last.largest) if last.alarmed else 0.0
         share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
-        worth = [one.chosen.log_bayes_factor for one in rounds if one.chosen]
+        present = {effect.name for effect in state.model.effects}
+        added = (one.chosen for one in rounds if one.chosen is not None)
+        worth = [one.log_bayes_factor for one in added if present.issuperset(one.added)]
         worth += _beside_others(state, scale.quiet)
         least = min(worth, default=np.inf)
         return cls(tuple(rounds), state, tuple(confounded), gained, share, least)
@@ -183,7 +179,8 @@ def search(
         rounds[-2:] = [replace(rounds[-2], chosen=None)]
     unnamed = any(effect.card.dynamics for effect in rounds[-1].state.model.effects)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
-        rounds += _pair(rounds[0], rounds[-1].state, looking, better)
+        paired, confounded = _pair(rounds[0], rounds[-1].state, looking, better, crew)
+        rounds, groups = rounds + paired, confounded if paired else groups
     return Search.ending(rounds, groups)
 
 
@@ -233,26 +230,44 @@ def _past_generic(
     further, more = _one_by_one(last, looking, crew, alone=False, before=rounds[:-1], generic=False)
     if len(further) == len(rounds):
         return rounds, groups
-    gained, _ = _gained(last.state, further[-1].state, last.trace.scale.quiet)
+    gained, _ = evidence_over(last.state, further[-1].state, last.trace.scale.quiet)
     ahead = last.trace.generic is None or gained > last.trace.generic.log_bayes_factor + MARGIN
     return (further, groups | more) if ahead else (rounds, groups)
 
 
 def _pair(
-    first: Round, state: State, looking: Callable[[State], Round], better: Callable[[State, State], bool]
-) -> list[Round]:
+    first: Round,
+    state: State,
+    looking: Callable[[State], Round],
+    better: Callable[[State, State], bool],
+    crew: Crew,
+) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
     """Rounds that add a pair of effects at once to what the `first` looked at, where that beats a `state`
-    with effects that were found one by one; else none."""
-    pair = _paired(first.state, state, first.trace)
+    with effects that were found one by one, and the names that each is confounded with; else none."""
+    pair = paired(first.state, state, first.trace)
     if pair is None:
-        return []
+        return [], {}
     look, kept = looking(in_proportion(pair.state)), pair
     if look.alarmed:
-        both = _both(first.state, state, pair, better)
-        if both is None:
-            return []
-        look, kept = (look if both is pair else looking(in_proportion(both.state))), both
-    return [replace(first, refits=(kept,), failures=(), chosen=kept), look]
+        one_or_both = both(first.state, state, pair, better)
+        if one_or_both is None:
+            return [], {}
+        look, kept = (look if one_or_both is pair else looking(in_proportion(one_or_both.state))), one_or_both
+    return [replace(first, refits=(kept,), failures=(), chosen=kept), look], _groups(kept, looking, crew)
+
+
+def _groups(chosen: Refit, looking: Callable[[State], Round], crew: Crew) -> dict[str, tuple[str, ...]]:
+    """Names that each of several effects which were added at once is confounded with beside the others."""
+    groups, white = {}, chosen.whitening
+    for name in chosen.added:
+        model, x = chosen.without([name])
+        fewer = Regression(model, white).descend(x, most=12, gain=0.02)
+        alone = replace(chosen, before=fewer, added=(name,), choice=0.0)
+        crew.stage(f"refitting with each effect that may stand for {name}")
+        look = looking(State(model, fewer, white)).refitted(crew, alone.log_bayes_factor)
+        refits = [one.under(white) for one in look.refits] if white.dependence else look.refits
+        groups[name] = group(look.state, alone, refits, look.trace)
+    return groups
 
 
 def _beside_others(state: State, quiet: float) -> list[float]:
@@ -265,18 +280,6 @@ def _beside_others(state: State, quiet: float) -> list[float]:
         own = paid(state.model, [effect.name])
         worth.append(log_bayes_factor(fewer, state.optimum, quiet) + own)
     return worth
-
-
-def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
-    """Log evidence over the base model's under one whitening, that of the final noise [nat], and the drop of
-    half the residual power [-]."""
-    if not state.model.effects:
-        return 0.0, 0.0
-    plain = start.optimum
-    if state.whitening is not start.whitening:
-        plain = Regression(start.model, state.whitening).descend(start.optimum.x)
-    gained = log_bayes_factor(plain, state.optimum, quiet) + paid(state.model) - paid(start.model)
-    return gained, plain.cost - state.optimum.cost
 
 
 def _kept(candidate: Refit) -> State:
@@ -312,56 +315,6 @@ def in_proportion(state: State) -> State:
             break
         state = replace(state, model=model, optimum=optimum)
     return state
-
-
-def _paired(start: State, state: State, seen: Trace) -> Refit | None:
-    """The best pair of effects, when its evidence beats what was found one by one; else None.
-
-    It is one of many, and its evidence pays for the choice.
-    """
-    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
-    ranked = sorted(
-        combinations(named, 2),
-        key=lambda pair: -pair_evidence(pair[0].signature, pair[1].signature, seen.residual),
-    )
-    have = {effect.name for effect in state.model.effects}
-    choice = float(np.log(max(len(ranked), 1)))
-    more = 2 - len(have) if len(have) < 2 else 0
-    bar, best = _gained(start, state, seen.scale.quiet)[0] + (1 + more) * MARGIN, None
-    for pair in ranked[:_PAIRS]:
-        if {one.name for one in pair} <= have:
-            continue
-        columns = np.concatenate([one.signature.columns for one in pair], axis=1)
-        inner = np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ seen.residual)
-        sizes = np.split(inner, [pair[0].signature.columns.shape[1]])
-        added = [(one.signature.effect, size) for one, size in zip(pair, sizes, strict=True)]
-        try:
-            candidate = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
-        except ArithmeticError:
-            continue
-        candidate = replace(under_one_noise([candidate])[0], choice=choice)
-        if candidate.log_bayes_factor > bar and acceptable(candidate, seen, seen.threshold):
-            bar, best = candidate.log_bayes_factor, candidate
-    return best
-
-
-def _both(start: State, state: State, pair: Refit, better: Callable[[State, State], bool]) -> Refit | None:
-    """A pair of which each effect predicts unseen records better beside the other; else the one of them that
-    does as well alone, when its evidence beats what was found one by one."""
-    alone = []
-    for effect, size in pair.model.sizes(pair.optimum.x):
-        others = [name for name in pair.added if name != effect.name]
-        near = pair.without(others)[1]
-        try:
-            one = refit(start.model, start.optimum, start.whitening, [(effect, size)], pair.quiet, near)
-        except ArithmeticError:
-            continue
-        if not better(pair.state, one.state):
-            alone.append(one)
-    if not alone:
-        return pair
-    best = max(alone, key=lambda one: one.log_bayes_factor)
-    return best if best.log_bayes_factor > _gained(start, state, pair.quiet)[0] + MARGIN else None
 
 
 def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:

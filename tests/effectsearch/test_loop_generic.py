@@ -68,7 +68,7 @@ def test_effects_are_found_past_a_class_that_is_ahead_of_each(
 ) -> None:
     """Any smooth residual takes 373 nat, a curvature alone 305: without the search for pairs, whose rank a
     plant that bends towards what is missing may spoil, no name was given."""
-    monkeypatch.setattr(rounds, "_pair", lambda *known: [])
+    monkeypatch.setattr(rounds, "_pair", lambda *known: ([], {}))
     both = study(seed, curvature=curvature, late=late)
     assert names(both) == {"odd_curvature", "trigger_jitter"}
     monkeypatch.setattr(rounds, "_past_generic", lambda known, groups, *others: (known, groups))

@@ -16,9 +16,8 @@ from lcopa_bayes.effectsearch import basemodel, noise, priorwidth, refits, signa
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
-from lcopa_bayes.effectsearch.refits import refit
+from lcopa_bayes.effectsearch.refits import evidence_over, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import _gained
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.effects.catalogue import catalogue
@@ -221,7 +220,7 @@ def test_an_effect_is_worth_what_its_refit_is():
     first = looped(1).rounds[0]
     chosen = first.chosen
     assert chosen.paid == pytest.approx(-np.log(priorwidth.COMMON))
-    gained, _ = _gained(first.state, chosen.state, chosen.quiet)
+    gained, _ = evidence_over(first.state, chosen.state, chosen.quiet)
     assert gained == pytest.approx(chosen.log_bayes_factor)
 
 

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from test_loop import LIBRARY, records, study
 
+from lcopa_bayes.core.crew import ALONE
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.candidates import other_instance
 from lcopa_bayes.effectsearch.freedconstants import released
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.refits import SIGNIFICANT, refit
+from lcopa_bayes.effectsearch.refits import SIGNIFICANT, evidence_over, refit
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.rounds import _beside_others, _gained, search
+from lcopa_bayes.effectsearch.rounds import Round, _beside_others, _groups, search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Scale, Signature
 from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
@@ -23,6 +24,8 @@ from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.model.effects.catalogue import catalogue
 
 LAW = np.array([[0.0, 5e-3, 0.6]])
+BENT = 0.06
+"""Curvature of a reading [1/rad]."""
 
 
 def coloured(seed):
@@ -97,10 +100,10 @@ def test_what_a_length_leaves_open_is_in_every_interval(pulsed):
 def test_an_effect_of_several_instances_is_worth_what_its_refit_is(pulsed):
     """The choice among the frames of a pulse is paid for in either."""
     plain, _ = pulsed.without(pulsed.added)
-    gained, _ = _gained(State(plain, pulsed.before, pulsed.whitening), pulsed.state, pulsed.quiet)
+    gained, _ = evidence_over(State(plain, pulsed.before, pulsed.whitening), pulsed.state, pulsed.quiet)
     assert gained == pytest.approx(pulsed.log_bayes_factor)
     assert pulsed.paid < -2.0
-    assert _gained(pulsed.state, pulsed.state, pulsed.quiet)[0] == 0.0
+    assert evidence_over(pulsed.state, pulsed.state, pulsed.quiet)[0] == 0.0
 
 
 def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
@@ -114,6 +117,25 @@ def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
     assert of_odd == pytest.approx(two.log_bayes_factor, abs=0.5)
     assert of_even < 5 < 30 < of_odd
     assert two.wald("even_curvature") > SIGNIFICANT
+
+
+def test_each_of_a_pair_has_the_names_that_may_stand_for_it_beside_the_other():
+    """A twin of the one under another name, and none of the other; alone each confounds both."""
+    made = study(2, 0.06)
+    made = replace(
+        made, fit=tuple(replace(one, response=one.response + BENT * one.response**2) for one in made.fit)
+    )
+    odd, even = (catalogue()[name] for name in ("odd_curvature", "even_curvature"))
+    twin = type("Twin", (odd,), {"card": replace(odd.card, name="twin")})
+    base = fitted_base(made, [], as_stated=True, draws=400).start
+
+    def looking(state: State) -> Round:
+        seen = trace(state, [odd, even, twin], np.random.default_rng(0), noise_samples=(1000,), draws=400)
+        return Round(state, seen)
+
+    pair = refit(base.model, base.optimum, base.whitening, [(odd(), np.zeros(1)), (even(), np.zeros(1))], 1e3)
+    groups = _groups(pair, looking, ALONE)
+    assert groups == {"odd_curvature": ("odd_curvature", "twin"), "even_curvature": ("even_curvature",)}
 
 
 def test_another_instance_is_one_of_another_signature():
