@@ -187,7 +187,7 @@ def candidates_of(
         except InputError as error:
             if asked is None and name == BY_ELEMENT:  # what is wrong with the study, the others say
                 continue
-            problems += [f"candidate {name!r}: {p}" if name not in p else p for p in error.problems]
+            problems += [f"candidate {name!r}: {p}" if repr(name) not in p else p for p in error.problems]
     refuse_if(problems)
     distinct: list[Candidate] = []
     for one in candidates:

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import final
 
+from lcopa_bayes.core.wording import listed
+
 ELSEWHERE = "or choose another folder with --out"
 REMEDIES = {
     errno.ENOSPC: "free some space and give the same command again",
@@ -22,6 +24,8 @@ REMEDIES = {
 """What to do about what the system refuses, by its error number."""
 _LONGEST = 100
 """Letters of a file's name that a message shows."""
+_LISTED = 20
+"""Known words that a message lists."""
 
 
 class InputError(ValueError):
@@ -74,4 +78,4 @@ def nearest(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, words, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
-    return f"; known: {', '.join(words)}" if words else ""
+    return f"; known: {listed(words, _LISTED)}" if words else ""

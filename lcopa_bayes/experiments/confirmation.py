@@ -17,7 +17,7 @@ from lcopa_bayes.calibration.replica import device_of
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.experiments.design import LINEAR, Design
+from lcopa_bayes.experiments.design import LINEAR, Design, promises
 from lcopa_bayes.experiments.information import Bench, Trial
 
 REPLICAS = 12
@@ -149,7 +149,7 @@ def confirm(design: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple
     Truths are two draws of the posterior: the one with the middle factor among those where the winner's
     bounds are small enough to be believed, and the one whose worst bound is the median of all. Fits are
     output-error least squares within the support of the study's priors, started at the truth. One record
-    per fit, whatever the `repeats` of the design.
+    per fit and no prior, whatever the design counts.
     """
     if not design.determined.any() or design.winner is design.step:
         return ()
@@ -190,10 +190,13 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
     values, table = design.draws[chosen], problem.posterior.table
     device = device_of(table, values, 0, time_unit=problem.study.time_unit)
     camera = VirtualBench(camera=period, exposure=problem.study.exposure)
-    tasks = []
+    tasks, expected = [], []
     for which, each in enumerate((design.winner, design.step)):
         drive, name = each.candidate.command, "simulated"
         bench = Bench(problem, each.time, period)
+        # of one record without a prior, as it is fitted, whatever the design counts beside it
+        (alone,) = promises(bench, [each.candidate], values[None])
+        expected.append(np.sqrt(np.diagonal(alone.covariance[0])))
         responding = table.effects and partial(bench.responses, values)
         clean = truth(device, camera, drive, duration=each.time, name=name, responding=responding)
         tasks += [
@@ -206,10 +209,12 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
         Achieved(
             promise.candidate.name,
             np.array([errors for errors, _ in part]),
-            np.sqrt(np.diagonal(promise.covariance[chosen])) * np.sqrt(design.repeats),
+            bounds,
             np.array([bound for _, bound in part]),
         )
-        for promise, part in ((design.winner, result[:replicas]), (design.step, result[replicas:]))
+        for promise, part, bounds in zip(
+            (design.winner, design.step), (result[:replicas], result[replicas:]), expected, strict=True
+        )
     )
     rng = np.random.default_rng([design.fit.study.seed, 10])
     factor, low, high = _factor(winner.errors, step.errors, design.determined, rng)

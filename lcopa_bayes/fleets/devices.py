@@ -18,7 +18,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import tables_in
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.runfolder import ORIGINS, digest, settings_of
+from lcopa_bayes.results.runfolder import ORIGINS, digest, flat, settings_of
 
 SHARED = ("gain", "time", "order", "delay")
 """Kinds of parameters that have a population."""
@@ -65,6 +65,8 @@ def basis(study: Study, verb: str, *, quick: bool) -> str:
         "quick": quick,
         "records": [digest(record) for record in (*study.fit, *study.held_out)],
         "settings": settings_of(study),
+        "compare": flat(study.compare),
+        "candidates": [flat(one) for one in study.candidates],
         "version": version("lcopa-bayes"),
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()

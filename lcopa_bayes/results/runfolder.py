@@ -179,11 +179,11 @@ def settings_of(study: Study) -> dict[str, Any]:
         **attributes(study, "name", "time_unit", "seed"),
         "fit": [record.name for record in study.fit],
         "held_out": [record.name for record in study.held_out],
-        "model": _flat(study.model),
-        "priors": {name: _flat(prior) for name, prior in study.priors.items()},
-        "noise": _flat(study.noise),
-        "sampler": _flat(study.sampler),
-        "effects": _flat(study.effects),
+        "model": flat(study.model),
+        "priors": {name: flat(prior) for name, prior in study.priors.items()},
+        "noise": flat(study.noise),
+        "sampler": flat(study.sampler),
+        "effects": flat(study.effects),
     }
 
 
@@ -240,7 +240,8 @@ def provenance(study: Study | None, verb: str) -> dict[str, Any]:
     }
 
 
-def _flat(settings: object) -> Any:
+def flat(settings: object) -> Any:
+    """A table of settings as plain values."""
     assert is_dataclass(settings)
     fields = {name: getattr(settings, name) for name in settings.__dataclass_fields__}
     return plain({k: dict(v) if isinstance(v, Mapping) else v for k, v in fields.items()})

@@ -244,6 +244,13 @@ def test_unknown_names_and_single_candidates_are_refused():
         candidates_of(study(record()), pick=["fractionl-2", "first-order"])
     with pytest.raises(InputError, match="1 candidate left"):
         candidates_of(study(record()), pick=["fractional-1", "study"])  # the same model twice
+
+
+def test_what_is_wrong_with_a_candidate_says_which_it_is_also_by_a_short_name():
+    """The letter occurs in the message anyway."""
+    short = CandidateSettings("a", terms={"zz": 2})
+    with pytest.raises(InputError, match="candidate 'a': "):
+        candidates_of(study(record()), extra=[short], pick=["a", "first-order"])
     with pytest.raises(InputError, match="no parameter 'gian'"):
         derived(study(record()), CandidateSettings("a", priors={"gian": PriorSettings("gian", dist="flat")}))
 

@@ -301,6 +301,20 @@ def test_the_winner_beats_the_step_as_promised_in_simulation(one):
     assert reported["sentence"] == " ".join(said)
 
 
+def test_precision_is_confirmed_by_what_one_record_alone_promises(one):
+    """Fits take one record and no prior, also where the design counts several and a prior beside them."""
+    fit, options = fitted(one), {"time": 120.0, "ladder": False, "draws": 3}
+    several = design(fit, **options, repeats=4, with_prior=True)
+    alone = promises(
+        Bench(fit.problem.thrifty, 120.0, several.limits.period), [several.winner.candidate], several.draws
+    )
+    covariances = [np.diagonal(each) for each in alone[0].covariance]
+    trials = confirm(several, replicas=2)
+    assert trials
+    for trial in trials:
+        assert any(np.allclose(trial.winner.expected**2, each, rtol=1e-6, atol=0.0) for each in covariances)
+
+
 def test_a_sum_is_recognised_at_draws_of_the_prior_under_drives_that_change_often():
     made = problem(record(camera=0.6), terms=2, orders=(0.8, 0.8))
     table, draws = made.posterior.table, made.posterior.table.draw(48, np.random.default_rng(1))

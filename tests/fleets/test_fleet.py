@@ -17,8 +17,9 @@ from small import ONE, check_page, path, record
 
 import lcopa_bayes as lb
 from lcopa_bayes.cli import main
+from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.studywriter import write_folder
-from lcopa_bayes.fleets.devices import row_of
+from lcopa_bayes.fleets.devices import basis, row_of
 from lcopa_bayes.fleets.summary import _shares, results
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects.catalogue import catalogue
@@ -153,6 +154,21 @@ def test_a_lost_worker_is_said_in_words(tmp_path):
     assert row["grade"] == "failed"
     assert row["reason"].startswith("its worker was lost, perhaps for want of memory (Attempted")
     assert "Inspect" not in row["reason"]
+
+
+def test_what_is_compared_is_part_of_what_a_device_rests_on():
+    """So that a resumed fleet compares again where other candidates are asked for."""
+    one = lb.Study("a", fit=[record(camera=0.5)])
+    bases = {
+        basis(each, "compare", quick=True)
+        for each in (
+            one,
+            replace(one, compare=replace(one.compare, pick=("fractional-1", "first-order"))),
+            replace(one, candidates=(CandidateSettings("own", terms=2),)),
+        )
+    }
+    assert len(bases) == 3
+    assert basis(one, "compare", quick=True) in bases
 
 
 @pytest.mark.slow
