@@ -1,9 +1,12 @@
 """The shape of the package: imports flow one way, plotting stays in `plot/`, modules stay small."""
 
 import ast
+import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -47,15 +50,59 @@ def place(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def imports(source: str) -> set[str]:
+class Kind(NamedTuple):
+    """What a class says of itself."""
+
+    name: str
+    bases: tuple[str, ...]
+    decorators: tuple[str, ...]
+    abstract: bool
+    """Whether a method of its own is."""
+
+
+class Source(NamedTuple):
+    """What the tests ask of a module, which is parsed once."""
+
+    imports: frozenset[str]
+    loaded: frozenset[str]
+    """Those that are made as it is loaded: what is there for types alone excepted."""
+    kinds: tuple[Kind, ...]
+
+
+def imported(nodes: list[ast.AST]) -> frozenset[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return found
+    return frozenset(found)
+
+
+def kind_of(node: ast.ClassDef) -> Kind:
+    bases, decorators = (tuple(map(ast.unparse, each)) for each in (node.bases, node.decorator_list))
+    of_methods = [map(ast.unparse, getattr(one, "decorator_list", ())) for one in node.body]
+    return Kind(node.name, bases, decorators, any("abstractmethod" in each for each in of_methods))
+
+
+@cache
+def read(source: str) -> Source:
+    tree = ast.parse(source)
+    for_types = [
+        one for one in tree.body if isinstance(one, ast.If) and "TYPE_CHECKING" in ast.dump(one.test)
+    ]
+    nodes = {one: [*ast.walk(one)] for one in tree.body}
+    every, loaded = (
+        [node for one, each in nodes.items() if one not in left_out for node in each]
+        for left_out in ([], for_types)
+    )
+    kinds = tuple(kind_of(node) for node in every if isinstance(node, ast.ClassDef))
+    return Source(imported(every), imported(loaded), kinds)
+
+
+def imports(source: str) -> frozenset[str]:
+    return read(source).imports
 
 
 def breaches(part: str, source: str) -> list[str]:
@@ -80,20 +127,10 @@ def test_every_module_stands_in_a_room():
     assert rooms == {part for row in ORDER for part in row} - LOOSE
 
 
-def loaded(source: str) -> set[str]:
-    """Imports that are made as a module is loaded: those for types alone excepted."""
-    tree = ast.parse(source)
-    typing = [
-        node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-    ]
-    tree.body = [node for node in tree.body if node not in typing]
-    return imports(ast.unparse(tree))
-
-
 def test_modules_import_in_no_circle():
     """Within rooms too."""
     names = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in MODULES}
-    left = {name: loaded(path.read_text()) & names.keys() for name, path in names.items()}
+    left = {name: read(path.read_text()).loaded & names.keys() for name, path in names.items()}
     while free := {name for name, used in left.items() if not used & left.keys()}:
         left = {name: used for name, used in left.items() if name not in free}
     assert sorted(left) == []
@@ -119,34 +156,39 @@ def test_modules_are_one_sitting_long(path: Path):
     assert len(path.read_text().splitlines()) <= LONGEST
 
 
+def kinds_of(sources: list[str]) -> list[Kind]:
+    return [kind for source in sources for kind in read(source).kinds]
+
+
 def concrete_bases(sources: list[str]) -> set[str]:
     """Classes without an abstract method of their own from which another class derives."""
-    classes = [
-        node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)
-    ]
-    bases = {node.name: {ast.unparse(base).partition("[")[0] for base in node.bases} for node in classes}
-    abstract = {
-        node.name
-        for node in classes
-        if bases[node.name] & {"ABC", "Protocol"}
-        or any("abstractmethod" in map(ast.unparse, getattr(one, "decorator_list", ())) for one in node.body)
-    }
+    kinds = kinds_of(sources)
+    bases = {kind.name: {base.partition("[")[0] for base in kind.bases} for kind in kinds}
+    abstract = {kind.name for kind in kinds if kind.abstract or bases[kind.name] & {"ABC", "Protocol"}}
     return {base for each in bases.values() for base in each if base in bases} - abstract
 
 
 def undecorated(sources: list[str]) -> set[str]:
     """Classes from which none derives and that do not say so."""
-    classes = [
-        node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)
-    ]
-    bases = {ast.unparse(base).partition("[")[0] for node in classes for base in node.bases}
+    kinds = kinds_of(sources)
+    bases = {base.partition("[")[0] for kind in kinds for base in kind.bases}
     return {
-        node.name
-        for node in classes
-        if node.name not in bases
-        and "Protocol" not in map(ast.unparse, node.bases)
-        and "final" not in map(ast.unparse, node.decorator_list)
+        kind.name
+        for kind in kinds
+        if kind.name not in bases and "Protocol" not in kind.bases and "final" not in kind.decorators
     }
+
+
+UNIT = re.compile(r"\} \{(?!\w*\.?time_unit)[a-z_.]*\.unit\}")
+"""A number of an axis or a parameter with its unit, in an f-string."""
+
+
+def test_units_of_numbers_are_left_out_where_there_is_none():
+    """By `units.measured`: a record whose unit is 1 has no "RMSE 0.2 1"."""
+    found = [path.name for path in MODULES if UNIT.search(path.read_text())]
+    assert found == []
+    assert UNIT.search('f"{rms:.3g} {band.unit}"')
+    assert not UNIT.search('f"{at:.3g} {self.time_unit}"')
 
 
 def test_every_class_is_abstract_or_final():
@@ -168,6 +210,12 @@ def test_importing_has_no_side_effects():
         "sys.exit(bool({'matplotlib', 'corner', 'emcee', 'pandas'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_what_is_imported_for_types_alone_makes_no_circle():
+    source = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import a\ndef f():\n    import b"
+    assert read(source).imports == {"typing", "typing.TYPE_CHECKING", "a", "b"}
+    assert read(source).loaded == {"typing", "typing.TYPE_CHECKING", "b"}
 
 
 def test_test_modules_have_names_of_their_own():

@@ -17,6 +17,7 @@ from lcopa_bayes.comparison.averaging import (
     simplest,
 )
 from lcopa_bayes.comparison.priorwidth import FACTORS
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import joined
 from lcopa_bayes.results.residuals import WHITE_P
 
@@ -273,9 +274,9 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
                     "model": fitted["name"],
                     "kind": "overfit",
                     "sentence": (
-                        f"it fits axis {axis} best (RMSE {fitted['residual_rms'][axis]:.3g} {unit}) and "
-                        f"predicts it worst (RMSE {error[fitted['name']]:.3g} {unit}; {least}: "
-                        f"{error[least]:.3g} {unit})"
+                        f"it fits axis {axis} best (RMSE {measured(fitted['residual_rms'][axis], unit)}) and "
+                        f"predicts it worst (RMSE {measured(error[fitted['name']], unit)}; {least}: "
+                        f"{measured(error[least], unit)})"
                     ),
                 }
             )

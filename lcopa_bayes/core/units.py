@@ -36,6 +36,7 @@ def per(unit: str, other: str) -> str:
     return f"1/{other}" if unit in DIMENSIONLESS else f"{unit}/{other}"
 
 
-def measured(figure: str, unit: str) -> str:
-    """A figure with its unit, alone where it has none."""
-    return figure if unit in DIMENSIONLESS else f"{figure} {unit}"
+def measured(figure: str | float, unit: str, form: str = ".3g") -> str:
+    """A figure with its unit, alone where it has none; a number in the `form` of its digits."""
+    shown = figure if isinstance(figure, str) else format(figure, form)
+    return shown if unit in DIMENSIONLESS else f"{shown} {unit}"

@@ -20,6 +20,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.crew import ALONE, Crew
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.description import FOLLOWED, Described, Followed, LaggedSum
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
@@ -175,8 +176,9 @@ def _at_once(record: Record) -> Disagreement:
     axis = record.response_axes[int(np.argmax(np.abs(moved)))]
     return Disagreement(
         (record.name,),
-        f"response {axis.name!r} of record {record.name!r} moves by {max(moved, key=abs):.3g} {axis.unit} in "
-        "the very row in which a drive first changes, while a drive holds from its row on",
+        f"response {axis.name!r} of record {record.name!r} moves by "
+        f"{measured(max(moved, key=abs), axis.unit)} in the very row in which a drive first changes, "
+        "while a drive holds from its row on",
         "if the drive of a row acted until its response was read, convert the table with `new --drive-until`",
         gross=False,
     )

@@ -26,6 +26,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
@@ -90,11 +91,11 @@ class Movement(NamedTuple):
     def _seen(self) -> str:
         record, axis = self.record, self.record.response_axes[self.axis]
         drives = zip(record.drive_axes, record.drive[0], strict=True)
-        rest = ", ".join(f"{drive.name} = {value:.6g} {drive.unit}" for drive, value in drives)
+        rest = ", ".join(f"{drive.name} = {measured(value, drive.unit, '.6g')}" for drive, value in drives)
         last = f"{record.time[self.until - 1]:.6g} {record.time_unit}"
         until_then = "throughout" if self.until == record.time.size else f"until {last}"
         return (
-            f"record {record.name!r}: response {axis.name!r} moves by {self.size:.3g} {axis.unit} "
+            f"record {record.name!r}: response {axis.name!r} moves by {measured(self.size, axis.unit)} "
             f"({100 * abs(self.size) / self.range:.0f} % of its range) while the drive stays as in the first "
             f"row ({rest}) {until_then}"
         )
@@ -241,7 +242,8 @@ def _scaled(role: str, axis: Axis, span: float) -> list[str]:
     if span == 0.0 or 1 / _SCALE < span < _SCALE:
         return []
     return [
-        f"{role} {axis.name!r} has a range of {span:.3g} {axis.unit}; give it in a unit that suits its size"
+        f"{role} {axis.name!r} has a range of {measured(span, axis.unit)}; give it in a unit that suits its "
+        "size"
     ]
 
 
@@ -253,7 +255,7 @@ def _drives(study: Study) -> list[str]:
         problems += _scaled("drive", axis, float(span))
         if 0.0 < span <= _ROUNDING * largest:
             problems.append(
-                f"drive {axis.name!r} changes by {span:.3g} {axis.unit} at values of {largest:.6g} "
+                f"drive {axis.name!r} changes by {measured(span, axis.unit)} at values of {largest:.6g} "
                 f"{axis.unit}, which is rounding: write it as constant, or give its changes with more digits"
             )
     return problems

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
@@ -67,7 +68,7 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
     if not gain > MARGIN:
         return None
     levels = " and ".join(
-        f"{value:.4g} {axis.unit} of {axis.name}"
+        f"{measured(value, axis.unit, '.4g')} of {axis.name}"
         for value, axis in zip(best.x, study.drive_axes, strict=True)
     )
     return Mended(

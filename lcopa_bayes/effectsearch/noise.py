@@ -18,6 +18,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
@@ -260,9 +261,9 @@ def axis_noise(
 def _named(posterior: PlausibleNoise, unit: str) -> str:
     law = Law.of(posterior)
     if law.share * law.rho < _SEEN:
-        return f"white noise of sd {law.sd:.3g} {unit}"
+        return f"white noise of sd {measured(law.sd, unit)}"
     part = "" if law.share > 1 - _SEEN else f" in {100 * law.share:.0f} % of its power"
-    return f"noise of sd {law.sd:.3g} {unit} and correlation {law.rho:.2f}{part}"
+    return f"noise of sd {measured(law.sd, unit)} and correlation {law.rho:.2f}{part}"
 
 
 def joint_noise(residual: Sequence[Observed], response: Axis, why: str, scales: Scales) -> AxisNoise:
@@ -281,7 +282,7 @@ def joint_noise(residual: Sequence[Observed], response: Axis, why: str, scales: 
     coloured = plausible(residual, scales)
     dependence = _dependence(pieces, Law.of(coloured))
     sentence = (
-        f"{response.name}: {why}. Its sd of {law.sd:.3g} {response.unit} is that of the residual, where "
+        f"{response.name}: {why}. Its sd of {measured(law.sd, response.unit)} is that of the residual, where "
         f"{count} samples count as {count / dependence:.0f} independent ones. An effect may pass for noise "
         "there, so no verdict is better than tentative."
     )

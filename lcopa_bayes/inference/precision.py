@@ -6,6 +6,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.inference.posterior import Posterior
 
 LEAST = -1e15
@@ -25,7 +26,9 @@ def refuse_unresolved(posterior: Posterior, values: Vector, log_density: float) 
     own = posterior.samples[r].record.response_axes[axis]
     seen = [one for one in posterior.samples if one.axes[axis].values.size]
     ranges = sorted((float(np.ptp(one.axes[axis].values)), one.record.name) for one in seen)
-    least, most = (f"{value:.3g} {own.unit} in record {name!r}" for value, name in (ranges[0], ranges[-1]))
+    least, most = (
+        f"{measured(value, own.unit)} in record {name!r}" for value, name in (ranges[0], ranges[-1])
+    )
     raise InputError(
         f"record {posterior.samples[r].record.name!r}: response {own.name!r} is about {distance:.2g} times "
         "the noise away from the plant that follows the records best, too far to calculate with; its range "

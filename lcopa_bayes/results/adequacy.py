@@ -21,6 +21,7 @@ import numpy as np
 from scipy.stats import binom
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
@@ -246,8 +247,8 @@ def _above_rest(problem: Problem, fitted: Sequence[Band]) -> Iterator[Limitation
         yield Limitation(
             "tentative",
             "intervals hold only if noise grew with the first change of the drive: the residual of "
-            f"{band.record}, axis {band.axis}, is {rms:.3g} {band.unit}, at rest noise is at most "
-            f"{most:.3g} {band.unit}",
+            f"{band.record}, axis {band.axis}, is {measured(rms, band.unit)}, at rest noise is at most "
+            f"{measured(most, band.unit)}",
             _ADD,
         )
 
@@ -273,7 +274,7 @@ def _ends(problem: Problem, draws: Draws) -> Iterator[Limitation]:
         elif isfinite(high) and np.median(column) > low + _END * (high - low):
             yield Limitation(
                 "tentative",
-                f"intervals hold only if {row.name} may not exceed {high:.3g} {row.unit}, the end of its "
-                "prior, near which it is",
+                f"intervals hold only if {row.name} may not exceed {measured(high, row.unit)}, the end of "
+                "its prior, near which it is",
                 _ADD,
             )

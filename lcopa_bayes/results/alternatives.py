@@ -20,6 +20,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -134,7 +135,7 @@ class Alternatives:
         moved = [one for one in self.numbers if one.open and one.moved and one.estimate.name in names]
         for others in dict.fromkeys(one.others for one in moved):
             own = [one.estimate for one in moved if one.others == others]
-            said = [f"{one.name} at {one.lower:.3g} to {one.upper:.3g} {one.unit}" for one in own]
+            said = [f"{one.name} at {one.lower:.3g} to {measured(one.upper, one.unit)}" for one in own]
             concerned = dict.fromkeys(parameter for one in own for parameter in names[one.name])
             out.append(
                 Limitation(

@@ -19,6 +19,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import obstacles
@@ -112,7 +113,7 @@ class FirstLook:
             shown = [band for band in self.bands if band.held_out == held]
             if shown:
                 said = ", ".join(
-                    f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit}" for band in shown
+                    f"{band.record}/{band.axis} RMSE {measured(band.rmse, band.unit)}" for band in shown
                 )
                 parts.append(f"{name}: {said}.")
         parts += [f"{self.whiteness}."] if self.whiteness else []

@@ -13,6 +13,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Axis, Driven
 
@@ -98,8 +99,8 @@ class FittedRange:
             if not least[k] - slack[k] <= rest[k] <= largest[k] + slack[k]:
                 known = f"{least[k]:.6g}" if least[k] == largest[k] else f"{least[k]:.6g} to {largest[k]:.6g}"
                 out.append(
-                    f"drive axis {axis.name!r} is at {rest[k]:.6g} {axis.unit} before its first change, but "
-                    f"the study's records rest at {known} {axis.unit}"
+                    f"drive axis {axis.name!r} is at {measured(rest[k], axis.unit, '.6g')} before its first "
+                    f"change, but the study's records rest at {measured(known, axis.unit)}"
                 )
         return out
 
@@ -126,9 +127,10 @@ class FittedRange:
                         "amplitude",
                         axis.name,
                         since,
-                        f"Drive {axis.name} runs from {column.min():.4g} to {column.max():.4g} {axis.unit}, "
-                        f"in the fit records from {self.low[k]:.4g} to {self.high[k]:.4g} {axis.unit}: from "
-                        f"{since:.4g} {self.time_unit} on the bands rest on the form of the model.",
+                        f"Drive {axis.name} runs from {column.min():.4g} to "
+                        f"{measured(column.max(), axis.unit, '.4g')}, in the fit records from "
+                        f"{self.low[k]:.4g} to {measured(self.high[k], axis.unit, '.4g')}: from {since:.4g} "
+                        f"{self.time_unit} on the bands rest on the form of the model.",
                     )
                 )
         return out

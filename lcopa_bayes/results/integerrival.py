@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.results.fit import Fit, fit
@@ -44,8 +45,8 @@ class Rival:
         held = ", ".join(f"{name} = {order:g}" for name, order in self.orders.items())
         pairs = zip(self.fit.bands, self.against.bands, strict=True)
         said = ", ".join(
-            f"{rival.record}/{rival.axis} RMSE {rival.rmse:.3g} {rival.unit} (free orders: {own.rmse:.3g}"
-            f"{'; offset from these samples' if rival.own_offset else ''})"
+            f"{rival.record}/{rival.axis} RMSE {measured(rival.rmse, rival.unit)} "
+            f"(free orders: {own.rmse:.3g}{'; offset from these samples' if rival.own_offset else ''})"
             for rival, own in pairs
             if rival.held_out
         )

@@ -14,6 +14,7 @@ from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
 from lcopa_bayes.inference.assembly import Problem
@@ -74,7 +75,7 @@ class Prediction(Result):
         ]
         if isinstance(self.driven, Record):
             parts += [
-                f"{band.axis}: RMSE {band.rmse:.3g} {band.unit}, {100 * band.coverage(0.9):.0f} % "
+                f"{band.axis}: RMSE {measured(band.rmse, band.unit)}, {100 * band.coverage(0.9):.0f} % "
                 f"of the samples in the {POINTWISE} 90 % band."
                 for band in self.bands
             ]

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.data.requirements import FEWEST
 from lcopa_bayes.inference.assembly import Problem
@@ -69,7 +70,7 @@ def rest_before(problem: Problem, values: Vector) -> Iterator[Limitation]:
     elif (shift := start.shift(found)).max() > MOVED:
         drive = record.drive[0] + found.levels[worst] * _ranges(problem)
         pairs = zip(record.drive_axes, drive, strict=True)
-        levels = listed([f"{axis.name} = {value:.4g} {axis.unit}" for axis, value in pairs])
+        levels = listed([f"{axis.name} = {measured(value, axis.unit, '.4g')}" for axis, value in pairs])
         name = posterior.table.names[start.own.columns[int(shift.argmax())]]
         said = f"{levels} {said} and moves {name} by {shift.max():.1f} posterior sd"
         yield _limitation(one, said)

@@ -85,13 +85,13 @@ def plant(table: ParameterTable, values: Vector) -> list[str]:
             e = layout.element_of[i][j]
             gain = values[table.at("gain", i, j)]
             delay = values[table.at("delay", layout.delay_of[i][j])]
-            size = measured(f"{gain:.4g}", per(response.unit, drive.unit))
+            size = measured(gain, per(response.unit, drive.unit), ".4g")
             below = layout.elements[e].name if e in named else f"({elements[e]})"
             lines.append(f"{response.name} / {drive.name} = {size} exp(-{delay:.4g} s) / {below}")
     lines += [f"{slot.name} = {elements[e]}" for e, slot in enumerate(layout.elements) if e in named]
     if table.effects is not None:
         lines += [
-            f"with {row.name} = {value:.4g} {row.unit}"
+            f"with {row.name} = {measured(value, row.unit, '.4g')}"
             for row, value in zip(table.rows, values, strict=True)
             if row.kind in (*COEFFICIENTS, *CONSTANTS)
         ]
@@ -103,13 +103,13 @@ def _fitted(fit: Fit | FirstLook) -> str:
     for axis, response in enumerate(fit.draws.table.layout.responses):
         own = [band for band in fit.bands if band.axis == response.name and not band.held_out]
         residual = np.concatenate([band.observed - band.plant[2] for band in own])
-        rms = measured(f"{np.sqrt(np.mean(residual**2)):.3g}", response.unit)
+        rms = measured(float(np.sqrt(np.mean(residual**2))), response.unit)
         said = f"The residual of {response.name} is {rms} rms"
         still = [one.quiet(axis).values for one in fit.problem.posterior.samples]
         free = sum(max(0, values.size - 1) for values in still)
         if free >= _AT_REST:
             squares = sum(float(np.sum((values - values.mean()) ** 2)) for values in still if values.size)
-            scatter = measured(f"{np.sqrt(squares / free):.3g}", response.unit)
+            scatter = measured(float(np.sqrt(squares / free)), response.unit)
             said += f", where samples at rest scatter by {scatter}"
         parts.append(said)
     return ". ".join(parts) + "."
@@ -124,7 +124,7 @@ def _predicted(fit: Fit | FirstLook) -> str:
     return (
         f"Of {len(held)} held-out response{several} the worst, {worst.record}/{worst.axis}, has "
         f"{100 * worst.coverage(0.9):.0f} % of its samples in the 90 % band and an error of "
-        f"{measured(f'{worst.rmse:.3g}', worst.unit)} rms."
+        f"{measured(worst.rmse, worst.unit)} rms."
     )
 
 
@@ -190,8 +190,9 @@ def _held_out_sentence(fit: Fit) -> list[str]:
     if not outside:
         return ["No record was held out, so prediction is untested."]
     said = ", ".join(
-        f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit} with {100 * band.coverage(0.9):.0f} % "
-        f"of samples in the pointwise 90 % band{' (offset from these samples)' if band.own_offset else ''}"
+        f"{band.record}/{band.axis} RMSE {measured(band.rmse, band.unit)} with "
+        f"{100 * band.coverage(0.9):.0f} % of samples in the pointwise 90 % band"
+        f"{' (offset from these samples)' if band.own_offset else ''}"
         for band in outside
     )
     own = "A constant error of a record whose offset comes from its scored samples cannot show."

@@ -194,7 +194,7 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
             out.append(f"{drive['axis']} stays at {measured(format(drive['rest'], '.4g'), drive['unit'])}.")
         else:
             at = f"{drive['first_change']:.4g} {unit}"
-            highest = measured(f"{drive['highest']:.4g}", drive["unit"])
+            highest = measured(drive["highest"], drive["unit"], ".4g")
             many = drive["changes"] != 1
             often = f"{drive['changes']} times from {at} on" if many else f"once, at {at}"
             out.append(
@@ -213,7 +213,7 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
         )
         said += f", {axis['missing']} missing" if axis["missing"] else ""
         if axis["scatter"] is not None:
-            scatter = measured(f"{axis['scatter']:.2g}", axis["unit"])
+            scatter = measured(axis["scatter"], axis["unit"], ".2g")
             said += f"; {axis['at_rest']} at rest, which scatter by {scatter}"
         if axis["onset"] is not None:
             said += f"; it moves clearly {axis['onset']:.3g} {unit} after the first change of a drive"

@@ -69,4 +69,5 @@ def test_the_unit_of_a_ratio(unit, other, ratio):
 
 @pytest.mark.parametrize(("unit", "said"), [("V", "0.2 V"), ("-", "0.2"), ("1", "0.2")])
 def test_a_number_without_a_unit_stands_alone(unit, said):
-    assert measured("0.2", unit) == said
+    assert measured("0.2", unit) == measured(0.2, unit) == said
+    assert measured(0.123456, unit, ".1f") == said.replace("0.2", "0.1")
