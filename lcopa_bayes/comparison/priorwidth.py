@@ -128,13 +128,14 @@ def _scaled(row: Parameter, factor: float) -> Parameter:
         # the lower end of a time is what sampling resolves: below it the model is not computed well
         low, high = (0.0, extra) if factor > 1 and row.kind == "time" else (-0.5 * extra, 0.5 * extra)
         values |= {"a": exp(ends[0] + low), "b": exp(ends[1] + high)}
-    elif row.prior.dist == "uniform" and row.kind == "delay" and values.get("loc", 0.0) == 0.0:
-        values["scale"] = values.get("scale", 1.0) * factor  # a delay is counted from zero
-    elif row.prior.dist == "uniform":
-        width = values.get("scale", 1.0)
-        values |= {"loc": values.get("loc", 0.0) + 0.5 * width * (1 - factor), "scale": width * factor}
-    elif row.prior.dist == "norm":
-        values["scale"] = values.get("scale", 1.0) * factor
+    elif row.prior.dist == "lognorm":
+        values["s"] *= factor
     else:
-        return row
+        low, high = row.prior.support
+        begins = low == 0.0 if row.kind == "delay" else np.isfinite(low) and np.isinf(high)
+        held = low if begins else float(row.prior.frozen.median())
+        values |= {
+            "loc": held + factor * (values.get("loc", 0.0) - held),
+            "scale": values.get("scale", 1.0) * factor,
+        }
     return replace(row, prior=Prior(row.prior.dist, values))

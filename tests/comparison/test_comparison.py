@@ -204,7 +204,7 @@ def test_draws_reweighted_to_fewer_data_are_those_of_the_smaller_posterior(rng, 
         return seen.sum() / 0.25 / precision, precision**-0.5
 
     mean, sd = exact(data)
-    positions = rng.normal(mean, sd, (3, 60, 2))
+    positions = rng.normal(mean, sd, (3, 40, 2))
     found = transferred(source, target, positions, 5, jump=False)
     wanted, spread = exact(data[:3])
     assert abs(wanted - mean) > 4 * sd  # far enough to be a test
@@ -235,6 +235,16 @@ def test_draws_reweighted_to_fewer_data_are_those_of_the_smaller_posterior(rng, 
         ("delay", "uniform", {"loc": 0.0, "scale": 4.0}, (0.0, 2.0), (0.0, 8.0)),
         ("delay", "uniform", {"loc": 2.0, "scale": 4.0}, (3.0, 2.0), (0.0, 8.0)),
         ("time", "loguniform", {"a": 0.01, "b": 100.0}, (0.1, 10.0), (0.01, 1e6)),
+        ("time", "lognorm", {"s": 0.5, "scale": 3.0}, (0.25, 3.0), (1.0, 3.0)),
+        ("gain", "halfnorm", {"loc": 1.0, "scale": 2.0}, (1.0, 1.0), (1.0, 4.0)),
+        (
+            "gain",
+            "beta",
+            {"a": 2.0, "b": 2.0, "loc": 2.0, "scale": 4.0},
+            (2.0, 2.0, 3.0, 2.0),
+            (2.0, 2.0, 0.0, 8.0),
+        ),
+        ("gain", "cauchy", {"loc": 1.0, "scale": 2.0}, (1.0, 1.0), (1.0, 4.0)),
     ],
 )
 def test_priors_half_and_twice_as_wide(kind, dist, reported, half, twice):
