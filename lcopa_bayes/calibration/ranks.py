@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 from scipy import stats
+from scipy.special import betainc, betaincc, gammaln, xlog1py, xlogy
 
 from lcopa_bayes.core.arrays import Array, Index, Vector
 from lcopa_bayes.core.estimate import attributes
@@ -105,14 +106,30 @@ def _leaving(replicas: int, values: int, inside: Limits) -> float:
     if (inside.lower > inside.upper).any():
         return 1.0
     at, mass, left = np.zeros(1, dtype=int), np.ones(1), 0.0
+    factorial = gammaln(np.arange(replicas + 1) + 1.0)
     for i, (low, high) in enumerate(zip(inside.lower, inside.upper, strict=True)):
         share, rest = 1 / (values - i), replicas - at
-        beyond = stats.binom.cdf(low - 1 - at, rest, share) + stats.binom.sf(high - at, rest, share)
-        left += float(mass @ beyond)
+        left += float(mass @ (_fewer(low - at, rest, share) + _more(high - at, rest, share)))
         then = np.arange(low, high + 1)
-        mass = mass @ stats.binom.pmf(then - at[:, None], rest[:, None], share)
+        falling = then - at[:, None]
+        count = np.maximum(falling, 0)
+        log_mass = factorial[rest][:, None] - factorial[count] - factorial[replicas - then]
+        log_mass += xlogy(count, share) + xlog1py(replicas - then, -share)
+        mass = mass @ np.where(falling < 0, 0.0, np.exp(log_mass))
         at = then
     return min(1.0, left)
+
+
+def _fewer(count: Index, of: Index, share: float) -> Vector:
+    """Binomial probability of fewer than `count`; that of `scipy.stats`, without its checks of every call."""
+    inner = betaincc(np.clip(count, 1, None), np.clip(of - count + 1, 1, None), share)
+    return np.select([count <= 0, count > of], [0.0, 1.0], inner)
+
+
+def _more(count: Index, of: Index, share: float) -> Vector:
+    """Binomial probability of more than `count`."""
+    inner = betainc(np.clip(count + 1, 1, None), np.clip(of - count, 1, None), share)
+    return np.select([count < 0, count >= of], [1.0, 0.0], inner)
 
 
 BAND = "Clopper-Pearson"
