@@ -140,7 +140,7 @@ class ExtendedModel:
         for low, high, k in zip(*self.bounds, self.columns, strict=True):
             row = self.posterior.table.rows[k]
             assert row.prior is not None
-            flat = (high - low) / np.sqrt(12) if np.isfinite(high - low) else float(row.prior.frozen.std())
+            flat = (high - low) / np.sqrt(12) if np.isfinite(high - low) else row.prior.sd
             pair = (np.nan, flat) if row.log_scale else row.prior.normal or (np.nan, flat)
             centre.append(pair[0])
             spread.append(pair[1])

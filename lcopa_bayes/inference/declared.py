@@ -200,7 +200,7 @@ def effect_rows(
     adding = not Declared(tuple(acting), ranges, np.zeros(0), (), ()).read_out
     for e, kind in enumerate(acting):
         constants = kind.internal(ranges)
-        instance = kind.with_constants(ranges, [one.low for one in constants])
+        instance = kind.with_constants(constants, [one.low for one in constants])
         coefficients = instance.coefficients(ranges)
         repeats = [f"[{name}]" for name in records] if kind.card.per_record and len(records) > 1 else [""]
         for r, suffix in enumerate(repeats):

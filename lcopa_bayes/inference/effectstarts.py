@@ -39,7 +39,7 @@ def effect_starts(posterior: Posterior, alone: Sequence[Vector], rng: np.random.
         start[plant] = values
         for k, row in enumerate(rows):
             if row.kind in COEFFICIENTS and row.prior is not None:
-                small = _HARDLY * float(row.prior.frozen.std()) if row.kind == "magnitude" else 0.0
+                small = _HARDLY * row.prior.sd if row.kind == "magnitude" else 0.0
                 start[k] = small if row.prior.support[0] <= small else float(row.prior.frozen.median())
         out += _with_constants(posterior, start, free, rng) if free else [start]
     return out

@@ -107,7 +107,7 @@ class Landscape:
         low, high = row.domain
         tails = row.quantiles((_TAIL, 1 - _TAIL))
         if not (row.log_scale or row.logit_scale):
-            mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
+            mean, sd = row.prior.frozen.mean(), row.prior.sd
             tails = np.array([mean - _FAR * sd, mean + _FAR * sd]) if np.isfinite(sd) else tails
         closed = row.log_scale or row.logit_scale  # zero and one are infinitely far away
         if not np.isfinite(low) or (closed and low <= 0.0):

@@ -135,7 +135,7 @@ class _Lift:
             elif row.kind in CONSTANTS:
                 out[:, k] = row.value if row.prior is None else row.draw(len(out), self.rng)
             elif row.kind == "magnitude" and row.prior is not None:
-                out[:, k] = _HARDLY_ACTS * float(row.prior.frozen.std())
+                out[:, k] = _HARDLY_ACTS * row.prior.sd
             elif row.kind in COEFFICIENTS:
                 out[:, k] = 0.0 if row.free else row.value
         return not own

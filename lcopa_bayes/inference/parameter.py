@@ -88,7 +88,7 @@ class Parameter:
             return inf
         if self.prior is None or self.log_scale or self.logit_scale:
             return 1.0
-        sd = float(self.prior.frozen.std())
+        sd = self.prior.sd
         return sd if 0.0 < sd < inf else 1.0
 
     def coordinate(self, values: Array | float) -> Array:

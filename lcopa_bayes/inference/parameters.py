@@ -186,7 +186,10 @@ class ParameterTable:
         for (times, orders), exchangeable in zip(self.terms, self.exchangeable, strict=True):
             if not (exchangeable or every):
                 continue
-            rank = np.argsort(-values[:, orders], axis=1, kind="stable")
+            own = values[:, orders]
+            if (own[:, 1:] <= own[:, :-1]).all():
+                continue  # sorted already, as most are
+            rank = np.argsort(-own, axis=1, kind="stable")
             back = np.argsort(rank, axis=1)
             for columns in (times, orders):
                 out[:, columns] = np.take_along_axis(values[:, columns], rank, axis=1)

@@ -70,12 +70,17 @@ class Prior:
         low, high = self.frozen.support()
         return float(low), float(high)
 
-    @property
+    @cached_property
+    def sd(self) -> float:
+        """Standard deviation; infinite or NaN where there is none."""
+        return float(self.frozen.std())
+
+    @cached_property
     def normal(self) -> tuple[float, float] | None:
         """Mean and standard deviation of the square that the logarithm of the density is; None for another.
         That of a half-normal density falls from its lower end."""
         if self.dist == "norm":
-            return float(self.frozen.mean()), float(self.frozen.std())
+            return float(self.frozen.mean()), self.sd
         if self.dist == "halfnorm":
             return self.support[0], self.parameters.get("scale", 1.0)
         return None

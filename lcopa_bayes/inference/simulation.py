@@ -20,6 +20,7 @@ from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import (
+    Constant,
     DriveEffect,
     Effect,
     ForceEffect,
@@ -90,11 +91,15 @@ class Simulation:
 
     def effects(self, values: Vector) -> tuple[Effect, ...]:
         """The effects with the internal constants of table values, (rows,)."""
-        ranges = self.declared.ranges
         return tuple(
-            kind.with_constants(ranges, values[rows].tolist())
-            for kind, rows in zip(self.declared.kinds, self.constants, strict=True)
+            kind.with_constants(own, values[rows].tolist())
+            for kind, own, rows in zip(self.declared.kinds, self._internal, self.constants, strict=True)
         )
+
+    @cached_property
+    def _internal(self) -> list[tuple[Constant, ...]]:
+        """Internal constants of each effect, whose ends are those of a grid of instances."""
+        return [kind.internal(self.declared.ranges) for kind in self.declared.kinds]
 
     def psi(self, values: Vector) -> Vector:
         """Coefficients as a simulator of this model's records takes them; those of another record are 0."""
@@ -114,8 +119,8 @@ class Simulation:
         """Coefficients of each effect, or of one record of it [-]."""
         ranges = self.declared.ranges
         instances = (
-            kind.with_constants(ranges, [one.low for one in kind.internal(ranges)])
-            for kind in self.declared.kinds
+            kind.with_constants(own, [one.low for one in own])
+            for kind, own in zip(self.declared.kinds, self._internal, strict=True)
         )
         return [len(instance.coefficients(ranges)) for instance in instances]
 

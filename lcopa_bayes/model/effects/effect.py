@@ -213,9 +213,9 @@ class Effect(ABC):
         return tuple(out)
 
     @classmethod
-    def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
-        """The instance with internal constants as numbers, in the order of `internal`."""
-        pairs = zip(cls.internal(ranges), values, strict=True)
+    def with_constants(cls, constants: Sequence[Constant], values: Sequence[float]) -> Self:
+        """The instance with its constants, those of `internal`, as numbers."""
+        pairs = zip(constants, values, strict=True)
         return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
