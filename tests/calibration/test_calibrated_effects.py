@@ -38,8 +38,8 @@ SOFT = -50.0
 
 
 def stiff(**settings: object) -> Study:
-    command = staircase([1.0, -0.7, 0.4, 0.0], hold=2.5, start=0.55)
-    one = record(command=command, camera=0.5, duration=12.0, name="r0")
+    command = staircase([1.0, -0.7, 0.0], hold=2.0, start=0.55)
+    one = record(command=command, camera=0.5, duration=6.5, name="r0")
     return with_effect(study(one, noise="white", seed=4, **settings), ["cubic_stiffness"], TRUTH)[0]
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib.util import module_from_spec, spec_from_file_location
 from itertools import product
@@ -45,7 +47,7 @@ from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.discretisation import resolved
-from lcopa_bayes.results.fit import fit, plan_of
+from lcopa_bayes.results.fit import Fit, fit, plan_of
 from lcopa_bayes.verbs.calibrate import results
 
 
@@ -336,12 +338,11 @@ def test_step_responses_are_looked_at_after_every_delay():
 
 
 def test_a_replica_that_fails_is_reported(monkeypatch, alone):
-    real = Replication.__call__
 
     def poor(self, number):
         if number == 1:
             raise ArithmeticError("two contours differ")
-        return real(self, number)
+        return alone.outcomes[number]
 
     monkeypatch.setattr(Replication, "__call__", poor)
     made = calibrate(STUDY, replicas=3)
@@ -370,7 +371,8 @@ def test_a_replica_that_fails_is_reported(monkeypatch, alone):
 
 
 def test_both_engines_give_a_replica_the_same_posterior():
-    reported = study(record(camera=0.6), noise="white", sampler={"ensembles": 2, "walkers": 32})
+    few = {"ensembles": 2, "walkers": 16, "target_ess": 150}
+    reported = study(record(camera=0.6), noise="white", sampler=few)
     found = {}
     for engine in ENGINES:
         made = replace(replication(reported), engine=engine)
@@ -411,11 +413,11 @@ STATED = {"gain": 2.1, "time_1": 1.4, "offset": 0.3, "sigma": 0.1}
 
 
 def test_a_stated_truth_is_the_same_in_every_replica():
-    made = calibrate(STUDY, replicas=3, truth=STATED)
+    made = calibrate(STUDY, replicas=2, truth=STATED)
     names = [quantity.name for quantity in made.replication.quantities]
     for outcome in made.outcomes:
         assert {name: outcome.truths[names.index(name)] for name in STATED} == STATED
-    assert len({outcome.ranks for outcome in made.outcomes}) == 3  # the noise differs
+    assert len({outcome.ranks for outcome in made.outcomes}) == 2  # the noise differs
     reported = results(made)
     assert reported["truths"] == {"from": "stated", "folder": None, "grade": None, "stated": STATED}
     assert "The truth was stated" in reported["verdict"]
@@ -571,7 +573,9 @@ def test_a_dask_cluster_gives_the_same_numbers(alone, address, tmp_path):
 
 
 def test_stored_replicas_are_not_done_again(alone, tmp_path, monkeypatch):
-    same(alone, calibrate(STUDY, replicas=3, folder=tmp_path))
+    store = Store.within(tmp_path, alone.replication)
+    for outcome in alone.outcomes:
+        store.save(outcome)
     (tmp_path / "replicas" / "00001.json").unlink()
     done = []
     real = Replication.__call__
@@ -625,16 +629,21 @@ def test_a_full_disk_leaves_the_store_intact(tmp_path, alone, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory) -> Path:
+def own() -> Fit:
+    return fit(STUDY)
+
+
+@pytest.fixture(scope="module")
+def fitted(own, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("fitted")
-    fit(STUDY).save(folder)
+    own.save(folder)
     return folder
 
 
-def test_truths_around_a_posterior_are_its_draws(fitted):
+def test_truths_around_a_posterior_are_its_draws(own, fitted):
     table = problem_of(STUDY).posterior.table
     truths = truths_around(fitted, table)
-    drawn = fit(STUDY).draws.flat
+    drawn = own.draws.flat
     truth = truths.draw(np.random.default_rng(1))
     assert (np.abs(drawn - truth).max(axis=1) == 0).any()
     assert truth[table.at("delay", 0)] == TRUTH["delay"]
@@ -731,10 +740,10 @@ def test_few_or_unreliable_replicas_are_graded_so(rng):
     assert results(gathered(rng, made, 20))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.8))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.3))["grade"] == "unusable"
-    reported = results(calibrate(STUDY, replicas=2, engine="sampling"))
+    reported = results(calibrate(STUDY, replicas=1, engine="sampling"))
     assert reported["grade"] == "unusable"
     assert reported["reliable"] is None
-    assert reported["replicas"] == 2
+    assert reported["replicas"] == 1
     json.dumps(reported, allow_nan=False)
 
 
@@ -835,12 +844,19 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_calibrate_writes_its_folder_and_prints_json(written, tmp_path, capsys, alone):
-    out = tmp_path / "run"
-    words = ("calibrate", written, "--replicas", 2, "--jobs", 1, "--out", out)
-    code, printed, _ = run(capsys, *words, "--json")
+@pytest.fixture(scope="module")
+def finished(written, tmp_path_factory) -> tuple[Path, str]:
+    """Folder of a calibration from the command line, and what it printed."""
+    out, printed = tmp_path_factory.mktemp("finished") / "run", io.StringIO()
+    words = ["calibrate", str(written), "--replicas", "2", "--jobs", "1", "--out", str(out), "--json"]
+    with redirect_stdout(printed):
+        assert main(words) == 0
+    return out, printed.getvalue()
+
+
+def test_calibrate_writes_its_folder_and_prints_json(finished, capsys):
+    out, printed = finished
     reported = json.loads(printed)
-    assert code == 0
     assert reported["replicas"] == 2
     assert reported["coverage"][0].keys() >= {"parameter", "level", "observed", "lower", "upper"}
     assert 0 < reported["p_value"] <= 1
@@ -857,16 +873,30 @@ def test_calibrate_writes_its_folder_and_prints_json(written, tmp_path, capsys, 
     assert (out / "report.html").read_bytes() == before
 
 
-def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("process", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_killed_calibration_resumes_to_the_same_result(written, finished, tmp_path, monkeypatch, process):
+    """Interrupted in this process, or killed in one of its own; files are as whole either way."""
     script = "import sys; from lcopa_bayes.cli import main; sys.exit(main(sys.argv[1:]))"
     words = ["calibrate", str(written), "--replicas", "2", "--quiet", "--jobs", "1", "--out"]
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert main([*words, str(whole)]) == 0
-    killed = subprocess.Popen([sys.executable, "-c", script, *words, str(cut)])
-    while not (cut / "replicas" / "00000.json").exists() and killed.poll() is None:
-        time.sleep(0.01)
-    killed.kill()
-    killed.wait()
+    (whole, _), cut = finished, tmp_path / "cut"
+    if process:
+        killed = subprocess.Popen([sys.executable, "-c", script, *words, str(cut)])
+        while not (cut / "replicas" / "00000.json").exists() and killed.poll() is None:
+            time.sleep(0.01)
+        killed.kill()
+        killed.wait()
+    else:
+        save = Store.save
+
+        def interrupted(store: Store, outcome: Outcome) -> None:
+            if outcome.replica == 1:
+                raise KeyboardInterrupt
+            save(store, outcome)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "save", interrupted)
+            assert main([*words, str(cut)]) != 0
     assert 1 <= len(list((cut / "replicas").glob("0*.json"))) < 2, "the run ended before it could be killed"
     assert main([*words, str(cut), "--resume"]) == 0
     reported = [json.loads((folder / "results.json").read_text()) for folder in (whole, cut)]

@@ -29,6 +29,7 @@ from lcopa_bayes.sampling.run import SamplePlan
 
 FEW = {"target_ess": 100}
 PICK = ("fractional-1", "first-order")
+CALLED = ("--pick", *PICK, "--quick", "--jobs", "1", "--quiet")
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 
 
@@ -47,7 +48,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def reported(folder) -> dict:
     out = folder / "run"
-    assert main(["compare", str(folder), "--pick", *PICK, "--out", str(out), "--jobs", "1", "--quiet"]) == 0
+    assert main(["compare", str(folder), *CALLED, "--out", str(out)]) == 0
     return json.loads((out / "compare.json").read_text())
 
 
@@ -92,8 +93,8 @@ def test_flat_directions_shift_the_evidence_by_the_log_of_the_width(reported):
 
 def test_a_finished_comparison_is_not_fitted_again(folder, reported, capsys):
     cards = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("candidate.json")}
-    options = ["--out", str(folder / "run"), "--jobs", "1", "--resume", "--json", "--quiet"]
-    assert main(["compare", str(folder), "--pick", *PICK, *options]) == 0
+    options = ["--out", str(folder / "run"), "--resume", "--json"]
+    assert main(["compare", str(folder), *CALLED, *options]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["models"] == reported["models"]
     assert len(cards) == 2

@@ -219,7 +219,8 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
 def test_the_share_of_modes_beside_any_evidence():
     """Of a posterior whose only mode they lie on: a half beside its own evidence, and all or nothing where
     that of the draws is thousands of nats away."""
-    fitted = fit(study(SHORT, priors=TRUE | {"time_1": ("lognorm", {"s": 0.3, "scale": 1.5})}))
+    own = TRUE | {"time_1": ("lognorm", {"s": 0.3, "scale": 1.5})}
+    fitted = fit(study(SHORT, priors=own, sampler={"target_ess": 100}), quick=True)
     own, starts = fitted.evidence, fitted.draws.thinned(64)
     assert own is not None
     shares = [

@@ -71,7 +71,13 @@ def test_white_noise_is_that_of_no_memory(rng):
         assert_allclose(white, none, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("nu", "shift"), [(1.5, 0.0), (4.0, 0.0), (1e7, 0.0), (1.5, 40.0), (4.0, 40.0)])
+@pytest.mark.parametrize(
+    ("nu", "shift"),
+    [
+        *((1.5, 0.0), (1e7, 0.0), (4.0, 40.0)),
+        *(pytest.param(*both, marks=pytest.mark.slow) for both in ((4.0, 0.0), (1.5, 40.0))),
+    ],
+)
 def test_a_level_under_student_noise_is_integrated(rng, nu, shift):
     """Against a dense even grid; with many degrees of freedom against Gaussian noise in closed form. What
     follows may stand far from what is known."""

@@ -110,15 +110,15 @@ def test_another_gain_of_a_plant_that_oscillates_is_a_contradiction() -> None:
 
 def test_the_standard_error_of_a_ratio_is_its_scatter() -> None:
     sizes, errors = [], []
-    for seed in range(40):
+    for seed in range(20):
         on = record(seed, name="on")
         half = scaled(record(100 + seed, name="half", command=step(0.5, at=0.35)), 1.3)
         for one in disagreements((on, half)):
             sizes.append(max(one.ratio, 1 / one.ratio))
             errors.append(float(one.reason.split("standard error ")[1].rstrip(")")) / one.ratio * sizes[-1])
-    assert len(sizes) == 40
+    assert len(sizes) == 20
     assert np.mean(sizes) == pytest.approx(1.3, abs=0.02)
-    assert 0.5 < np.std(sizes) / np.mean(errors) < 2.0  # 40 seeds: 0.22 in a standard deviation
+    assert 0.5 < np.std(sizes) / np.mean(errors) < 2.0  # of 20 seeds: known to 0.16
 
 
 def test_the_odd_record_of_several_is_named_once() -> None:
@@ -176,7 +176,7 @@ def test_drives_that_move_one_after_the_other_and_act_alike_are_not_exchanged() 
     assert "drives 'x' and 'y' exchanged" in said.reason
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(ahead=st.floats(1.5, 3.0), seed=st.integers(0, 99))
 def test_a_response_ahead_of_its_drive_is_recognised_with_its_lead(ahead: float, seed: int) -> None:
     one = record(seed, command=step(1.0, at=5.0), duration=20.0)
@@ -195,7 +195,7 @@ def led_by_a_row(seed: int, order: float, *, rows: int, noise_sd: float = 0.01) 
     return replace(one, drive=np.concatenate([one.drive[:1]] * rows + [one.drive])[: len(one.drive)])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 999), order=st.sampled_from([0.5, 0.8, 1.0]))
 def test_a_drive_that_acted_until_its_row_is_recognised(seed: int, order: float) -> None:
     late, own = (led_by_a_row(seed, order, rows=rows) for rows in (1, 0))
@@ -254,7 +254,7 @@ def test_a_response_that_rings_to_a_limit_is_not_ahead_of_its_drive(seed: int) -
     assert disagreements((changed(one, np.clip(one.response, -limit, limit)),)) == ()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 9), clock=st.sampled_from([1e-9, 1.0, 1e6]), unit=st.sampled_from([1e-12, 1.0, 1e9])
 )

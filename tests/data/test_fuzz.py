@@ -2,9 +2,9 @@
 
 Files of `corpus`, and tables, workbooks and run folders made here, are cut, spliced and encoded anew.
 No other exception and no warning may come of it, and no input may take longer than `MOST`. The environment
-variable LCOPA_BAYES_FUZZ is the number of inputs in all, such as 1000000; above the default they are new
-ones in every run. LCOPA_BAYES_FUZZ_SUMMARY is a file for what came of them, as `studies/robustness/fuzz.py`
-reports it.
+variable LCOPA_BAYES_FUZZ is the number of inputs in all, such as 20000 or 1000000; above the default they are
+new ones in every run. LCOPA_BAYES_FUZZ_SUMMARY is a file for what came of them, as
+`studies/robustness/fuzz.py` reports it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # xarray leaves files open
 ]
 CORPUS = Path(__file__).parent / "corpus"
-DEFAULT = 20_000
+DEFAULT = 4_000
 INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", DEFAULT))
 MOST = 5.0
 """Longest time that one input may take [s]."""
@@ -202,10 +202,10 @@ def mutated(*seeds: bytes) -> st.SearchStrategy[bytes]:
     return st.one_of(near, near, near, near, st.binary(max_size=200))
 
 
-def many(share: float) -> Callable[[Callable], Callable]:
-    """So much of all inputs."""
+def many(share: float, *, least: int = 1) -> Callable[[Callable], Callable]:
+    """So much of all inputs, and no fewer than `least`."""
     return settings(
-        max_examples=max(1, int(share * INPUTS)),
+        max_examples=max(least, int(share * INPUTS)),
         deadline=None,  # `refused_or` has its own, which a reader that hangs does not outlast
         database=None,
         derandomize=INPUTS <= DEFAULT,
@@ -356,7 +356,7 @@ def run(tmp_path_factory) -> Path:
 def test_run_folders(run, tmp_path, name):
     shutil.copytree(run, tmp_path, dirs_exist_ok=True)
 
-    @many(0.0025)
+    @many(0.0025, least=20)
     @given(data=mutated((run / name).read_bytes()))
     def read(data):
         (tmp_path / name).write_bytes(data)
@@ -376,7 +376,7 @@ def test_a_fit_on_blocks_without_bound_is_refused(run, tmp_path, refinement):
         load_result(tmp_path)
 
 
-@many(0.005)
+@many(0.005, least=50)
 @given(data=st.data())
 def test_values_of_a_fit(run, place, data):
     """Entries of the right file that hold something else."""

@@ -55,7 +55,8 @@ def test_what_constants_of_effects_leave_open_moves_no_prediction() -> None:
 def test_draws_along_a_ridge_are_used() -> None:
     """They predict the record held out as the optimum does, and normal draws about it do not."""
     records = (record("a", 1), record("b", 2)), (record("held", 3),)
-    found = loop(Study("ridge", None, "us", 3, *records, ModelSettings(terms=2)), as_stated=True, quick=True)
+    study = Study("ridge", None, "us", 3, *records, ModelSettings(terms=2))
+    found = loop(study, library=[], as_stated=True, quick=True)
     assert found.draws is not None
     assert found.cautions == ()
     assert found.after.unseen[0].rmse == pytest.approx(NOISE, rel=0.15)

@@ -71,9 +71,16 @@ def assert_scored(found: Loop) -> None:
         assert all(score["rmse"] < 1.3 * NOISE for score in scores), scores
 
 
-@pytest.mark.parametrize("axes", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_the_whole_catalogue_with_dark_records_fitted_and_held_out(axes: int):
-    found = loop(with_dark(axes), quick=True)
+@pytest.mark.parametrize(
+    ("axes", "sample"),
+    [
+        pytest.param(1, True, marks=pytest.mark.slow),
+        pytest.param(2, True, marks=pytest.mark.slow),
+        (2, False),
+    ],
+)
+def test_the_whole_catalogue_with_dark_records_fitted_and_held_out(axes: int, sample: bool):
+    found = loop(with_dark(axes), quick=True, sample=sample)
     assert found.base.failed == ""
     assert found.verdict.kind == "clean"
     assert {one.name: one.failed for one in found.trace.traced if one.failed} == {}

@@ -32,6 +32,7 @@ LATE = record(3, command=step(1.0, at=5.0), duration=20.0, name="early")
 FIRST, SECOND, THIRD = (
     of_two_axes(seed, to) for seed, to in enumerate(((1.0, 0.6), (-0.5, 1.0), (1.0, 0.2)))
 )
+LIBRARY = [catalogue()[name] for name in ("odd_curvature", "gain_drift", "unmodelled_smooth")]
 CASES = {
     "unit": ((ON, scaled(HALF, 1e3)), (), "another unit than it states"),
     "unit of a held-out record": ((ON,), (scaled(HALF, 1e3),), "another unit than it states"),
@@ -48,7 +49,8 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_no_effect_is_named_from_records_that_no_plant_follows(name):
     fit, held_out, said = CASES[name]
-    found = loop(study(*fit, held_out=held_out), sample=False, quick=True, as_stated=True)
+    made = study(*fit, held_out=held_out)
+    found = loop(made, library=LIBRARY, sample=False, quick=True, as_stated=True)
     assert (found.verdict.kind, found.effects) == ("unexplained", ())
     assert said in found.verdict.sentence
     assert all(f"'{one}'" in found.verdict.sentence for one in found.contrary[0].records)
@@ -77,9 +79,8 @@ def test_bands_hold_what_a_plant_does_not_follow():
 
 def test_records_of_two_plants_are_named_beside_what_is_traced():
     """20 standard errors apart: both records are named, whatever the verdict."""
-    library = [catalogue()[name] for name in ("odd_curvature", "gain_drift", "unmodelled_smooth")]
     made = study(ON, scaled(HALF, 1.3))
-    found = loop(made, library=library, sample=False, quick=True, as_stated=True)
+    found = loop(made, library=LIBRARY, sample=False, quick=True, as_stated=True)
     (said,) = (one for one in found.cautions if one.startswith("records disagree"))
     assert "'half'" in said
     assert "'on'" in said
@@ -89,6 +90,6 @@ def test_records_of_two_plants_are_named_beside_what_is_traced():
 
 
 def test_records_that_agree_are_not_called_contrary():
-    found = loop(study(ON, HALF), sample=False, quick=True, as_stated=True)
+    found = loop(study(ON, HALF), library=LIBRARY, sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "clean"
     assert not any("disagree" in one for one in found.cautions)

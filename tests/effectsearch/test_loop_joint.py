@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -50,9 +51,15 @@ def fitted(study):
     return base_fit(ExtendedModel(problem_of(study).posterior), np.random.default_rng(0))
 
 
-def test_a_start_away_from_rest_is_found():
+@cache
+def away():
+    """A study whose records began away from rest, and its fit."""
     study = study_of(3.5)
-    made = started(study, fitted(study))
+    return study, fitted(study)
+
+
+def test_a_start_away_from_rest_is_found():
+    made = started(*away())
     assert made is not None
     for record in (*made.study.fit, *made.study.held_out):
         assert record.drive[0, 0] == pytest.approx(3.5, abs=0.02)
@@ -64,13 +71,12 @@ def test_a_start_away_from_rest_is_found():
 def test_a_start_at_rest_or_a_stated_one_is_left_alone():
     resting = study_of(float(walked("a", 0.0, 1).drive[0, 0]))
     assert started(resting, fitted(resting)) is None
-    away = study_of(3.5)
-    made = started(away, fitted(away))
+    made = started(*away())
     assert started(made.study, fitted(made.study)) is None
 
 
 def test_a_start_level_predicts_records_held_out():
-    found = loop(study_of(3.5), library=[], sample=False, quick=True, as_stated=True)
+    found = loop(study_of(3.5, n=300), library=[], sample=False, quick=True, as_stated=True)
     assert "V of x" in found.enlarged
     assert found.before.unseen[0].rmse == pytest.approx(0.02, rel=0.15)
 

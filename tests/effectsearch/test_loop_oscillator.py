@@ -21,7 +21,7 @@ OMEGA, DAMPING, CUBIC, PERIOD = 0.44, 0.045, 4.0, 1.6
 """Resonance [rad/ms], damping [-], cubic stiffness over the linear one [1/V^2], sampling period [ms]."""
 NOISE, OUTPUT = 2e-4, 0.053
 """Noise and response, standard deviations [V]."""
-_FINE = 20
+_FINE = 8
 """Steps of the reference simulation per sample [-]."""
 
 

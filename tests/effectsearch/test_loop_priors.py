@@ -61,8 +61,8 @@ def error(found: Loop) -> float:
 
 
 def test_a_large_effect_is_estimated_without_bias(monkeypatch):
-    """Three draws of noise; held to the default prior the same refits are wrong by three sd."""
-    seeds = (1, 2, 3)
+    """Two draws of noise; held to the default prior the same refits are wrong by three sd."""
+    seeds = (1, 2)
     found = [looped(seed) for seed in seeds]
     errors = np.array([error(one) for one in found])
     assert np.abs(errors).max() < 3.0
@@ -249,7 +249,9 @@ def _marginal(model: ExtendedModel, x: np.ndarray, k: int, at: float, whitening)
 
 
 def test_an_effect_within_its_prior_keeps_it():
-    found = loop(study(2, 0.06), library=LIBRARY, sample=False, quick=True, as_stated=True)
+    made = study(2, 0.06)
+    made = replace(made, fit=made.fit[:2])
+    found = loop(made, library=LIBRARY, sample=False, quick=True, as_stated=True)
     assert found.names == ("odd_curvature",)
     assert found.after.state.model.wider == {}
     assert "too narrow" not in found.verdict.sentence

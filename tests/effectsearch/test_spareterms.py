@@ -23,6 +23,7 @@ from lcopa_bayes.effectsearch.spareterms import (
 )
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.elementterms import terms_in_words
+from lcopa_bayes.model.path import TransferPath
 
 RESPONSES = TWO.response_axes
 TWO_TERMS, ONE_TERM = path(1.0, 0.5, (1.0, 2.0), (1.9, 0.7)), path(1.0, 0.5, (1.5,), (0.9,))
@@ -44,7 +45,7 @@ def campaign(device: Device, **settings: object) -> Study:
 
 def fitted(one: Study, terms: object, **settings: object) -> tuple[Problem, BaseFit]:
     problem = problem_of(replace(one, model=replace(one.model, terms=terms, **settings)))
-    return problem, base_fit(ExtendedModel(problem.posterior), np.random.default_rng(1), starts=4)
+    return problem, base_fit(ExtendedModel(problem.posterior), np.random.default_rng(1), starts=2)
 
 
 @cache
@@ -67,13 +68,15 @@ def test_the_term_that_no_record_asks_for_is_taken_out() -> None:
     assert values["gain_y_u"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_plant_of_equal_elements_keeps_them_all_or_none() -> None:
-    for own, kept in ((TWO_TERMS, 2), (ONE_TERM, 1)):
-        device = replace(UNEQUAL, paths=((own,), (replace(own, gain=-0.8),)))
-        one = campaign(device, **OWN)
-        (_, smaller), (problem, larger) = fitted(one, 1), fitted(one, 2)
-        _, fit = without_spare_terms(problem, larger, smaller)
-        assert set(fit.model.plant.table.layout.terms.values()) == {kept}
+@pytest.mark.parametrize(
+    ("own", "kept"), [pytest.param(TWO_TERMS, 2, marks=pytest.mark.slow), (ONE_TERM, 1)], ids=["all", "none"]
+)
+def test_a_plant_of_equal_elements_keeps_them_all_or_none(own: TransferPath, kept: int) -> None:
+    device = replace(UNEQUAL, paths=((own,), (replace(own, gain=-0.8),)))
+    one = campaign(device, **OWN)
+    (_, smaller), (problem, larger) = fitted(one, 1), fitted(one, 2)
+    _, fit = without_spare_terms(problem, larger, smaller)
+    assert set(fit.model.plant.table.layout.terms.values()) == {kept}
 
 
 def test_what_paths_share_is_kept_beside_a_term_that_is_taken_out() -> None:

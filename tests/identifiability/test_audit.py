@@ -420,8 +420,7 @@ CASES = {
 @pytest.mark.parametrize("verdict", CASES)
 def test_each_verdict_is_recognised(verdict):
     name, options = CASES[verdict]
-    recognised = [found_of(name, seed, **options).verdict for seed in range(2)]
-    assert recognised == [verdict] * 2
+    assert found_of(name, 0, **options).verdict == verdict
 
 
 def test_an_interval_that_spans_more_than_a_factor_of_two_is_weakly_identified():

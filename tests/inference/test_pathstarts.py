@@ -89,7 +89,7 @@ def oscillators(times: tuple[float, ...], jitter: float) -> Record:
 
 
 @pytest.mark.parametrize(("times", "jitter"), [((2.0, 2.0), 0.0), ((2.0, 5.0), 0.0), ((2.0, 3.0), 1.0)])
-@pytest.mark.parametrize("starts", [2, 4])
+@pytest.mark.parametrize("starts", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_resonances_of_several_drives_are_found(times, jitter, starts):
     """With the noise of the record; a plant whose one path takes the part of the other leaves five times that
     or more."""

@@ -48,7 +48,11 @@ def test_draws_of_a_level_are_of_its_exact_density(misfit, nu):
 
 @pytest.mark.parametrize(
     ("nu", "command", "samples"),
-    [(2.5, step(1.0, at=2.0), 14), (2.5, quiet(0.0), 39), (1.2, step(1.0, at=2.0), 14)],
+    [
+        pytest.param(2.5, step(1.0, at=2.0), 14, marks=pytest.mark.slow),
+        (2.5, quiet(0.0), 39),
+        (1.2, step(1.0, at=2.0), 14),
+    ],
 )
 def test_levels_of_held_out_records_cover_as_often_as_they_say(nu, command, samples):
     """Truth known but for the level: 50 and 90 % intervals from simulated quiet samples, 300 replicates."""

@@ -40,7 +40,7 @@ FEW = Scan(
 def measured(name: str, level: tuple[float, float], rest: tuple[float, float] = (0.0, 0.0)):
     rng = np.random.default_rng([4, len(name)])
     drive = step(level, rest=rest)
-    bench = Bench(camera=0.2, noise_sd=NOISE)
+    bench = Bench(camera=0.4, noise_sd=NOISE)
     return simulate(PAPER_DEVICE, bench, drive, duration=25.0, name=name, rng=rng)
 
 

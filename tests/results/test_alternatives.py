@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +19,19 @@ from lcopa_bayes.results.averages import parts_of_sd
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerfit import integer_fit
+from lcopa_bayes.sampling import lagdraws
 from lcopa_bayes.verbs.fit import fit
 
 QUICK = {"target_ess": 50}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_draws() -> Iterator[None]:
+    """A quarter of the draws of sums of lags: no number here is compared with another run's."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_DRAWN", "_WANTED", "_KEPT"):
+            patch.setattr(lagdraws, name, getattr(lagdraws, name) // 4)
+        yield
 
 
 def one_term(study: Study) -> Fit:
@@ -95,11 +106,14 @@ def test_a_better_sum_of_lags_limits_every_number(beside: Fit) -> None:
     assert "of sums of lags" in reported.note
 
 
-def test_figures_over_lags_are_no_better_than_the_fit(short: Fit) -> None:
+def test_figures_over_lags_are_no_better_than_the_fit(
+    short: Fit, over: Alternatives, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Few effective draws make a number tentative at best, not what is unusable anyway."""
     few = tuple(replace(one, ess_bulk=50.0) for one in short.draws.qualities)
     poor = replace(short, draws=replace(short.draws, qualities=few))
     assert poor.draws.grade.level == "unusable"
+    monkeypatch.setattr("lcopa_bayes.results.alternatives.lags_beside", lambda *_, **__: over.alternatives)
     graded = with_alternatives(poor, None).alternatives
     assert graded is not None
     assert {one.estimate.grade for one in graded.numbers} == {"unusable"}
@@ -162,7 +176,8 @@ def test_a_fit_whose_structure_the_records_chose_shows_them(tmp_path: Path) -> N
 
 
 def test_a_stated_structure_has_none() -> None:
-    assert fit(study(record(), sampler=QUICK)).alternatives is None
+    stated = study(record(camera=0.8), sampler=QUICK, priors={"delay": 0.73, "order_1": 0.8})
+    assert fit(stated).alternatives is None
 
 
 def test_the_square_of_the_parts_is_the_variance_of_the_mixture() -> None:

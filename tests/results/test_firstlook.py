@@ -126,6 +126,7 @@ def test_a_look_is_saved_read_back_and_drawn_again(tmp_path, capsys):
     assert "run `look` again" in message
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_fit_in_a_folder_begins_with_a_look_unless_it_is_quiet(tmp_path, capsys):
     tiny = {"target_ess": 50}
     plain = study(ON, priors=KNOWN, sampler=tiny)

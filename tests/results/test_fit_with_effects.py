@@ -52,7 +52,7 @@ def test_the_interval_holds_the_truth(stiff: tuple[Fit, np.ndarray]):
 def test_the_evidence_speaks_for_the_effect(stiff: tuple[Fit, np.ndarray]):
     """Against the same study without, by another sampler."""
     found, _ = stiff
-    plain = replace(found.study, effects=EffectsSettings(), sampler=SamplerSettings(2, 16, 160))
+    plain = replace(found.study, effects=EffectsSettings(), sampler=SamplerSettings(target_ess=50))
     other = fit(plain, quick=True)
     assert found.evidence is not None
     assert other.evidence is not None

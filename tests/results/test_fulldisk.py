@@ -32,7 +32,8 @@ from small import record, study
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.results.datatree import save_tree
+from lcopa_bayes.results.datatree import posterior_tree, save_tree
+from lcopa_bayes.sampling.sampler import sample
 
 def limit(size):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
@@ -45,10 +46,15 @@ def refused(act):
     return []
 
 folder = Path(sys.argv[1])
-sampler = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100_000}
-task = study(record(camera=0.8), sampler=sampler, priors={"delay": 0.73, "order_1": 0.8})
+sampler = {"ensembles": 2, "walkers": 8, "steps": 60, "thin": 1, "target_ess": 100_000}
+priors = {  # close about the truth, so that tempering is short
+    "delay": 0.73,
+    "order_1": 0.8,
+    "time_1": ("uniform", {"loc": 1.3, "scale": 0.4}),
+    "sigma": ("uniform", {"loc": 0.01, "scale": 0.02}),
+}
+task = study(record(camera=0.8), sampler=sampler, priors=priors)
 reported = {}
-whole = fit(task)
 path = folder / "chain.h5"
 limit(int(sys.argv[2]))
 reported["chain"] = refused(lambda: fit(task, folder=folder))
@@ -58,17 +64,21 @@ reported["again"] = refused(lambda: fit(task, folder=folder, resume=True))
 reported["kept"] = path.read_bytes() == kept
 limit(resource.RLIM_INFINITY)
 resumed = fit(task, folder=folder, resume=True)
-reported["same"] = bool(np.array_equal(whole.draws.values, resumed.draws.values))
+whole = sample(resumed.problem.posterior, resumed.run.plan)
+pairs = zip(whole.ensembles, resumed.run.ensembles, strict=True)
+reported["same"] = all(np.array_equal(one.chain, other.chain) for one, other in pairs)
 reported["sizes"] = len(kept), path.stat().st_size
 
+tree = posterior_tree(resumed, compact=True)
+
 def save():
-    write_whole(folder / "posterior.nc", lambda beside: save_tree(resumed.to_datatree(), beside))
+    write_whole(folder / "posterior.nc", lambda beside: save_tree(tree, beside))
 
 save()
 before = (folder / "posterior.nc").read_bytes()
 reported["sizes"] += (len(before),)
 reported["posterior"] = []
-for size in (0, 3000, len(before) // 2, len(before) - 1):
+for size in (0, len(before) // 2, len(before) - 1):
     limit(size)
     reported["posterior"] += refused(save)
 limit(resource.RLIM_INFINITY)
@@ -77,8 +87,8 @@ reported["stray"] = sorted(p.name for p in folder.rglob(".*"))
 save()
 print(json.dumps(reported))
 """
-LIMIT = 40_000
-"""Room for a chain of one or two rounds, not of three [bytes]."""
+LIMIT = 30_000
+"""Room for a chain of one round, not of two [bytes]."""
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +122,7 @@ def test_the_run_is_taken_up_to_the_same_draws(reported):
 
 
 def test_a_posterior_that_does_not_fit_leaves_the_old_one(reported):
-    assert len(reported["posterior"]) == 4
+    assert len(reported["posterior"]) == 3
     for said in reported["posterior"]:
         assert said.startswith(f"{reported['folder']}/posterior.nc: cannot be written (File too large)")
     assert reported["intact"]
@@ -133,10 +143,7 @@ kind = "white"
 delay = 0.73
 order_1 = 0.8
 [sampler]
-ensembles = 2
-walkers = 16
-steps = 40
-thin = 1
+target_ess = 50
 """
 
 
@@ -147,10 +154,13 @@ def sampled(tmp_path_factory) -> list[str]:
     save_record(record(camera=0.8), folder / "a.csv")
     (folder / "study.toml").write_text(STUDY)
     command = ["fit", str(folder / "study.toml"), "--jobs", "1", "--quiet", "--out", str(folder / "out")]
-    assert main(command) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: "<svg></svg>")
+        assert main(command) == 0
     return [*command, "--resume"]
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "at",
     [
@@ -179,9 +189,9 @@ def test_whatever_file_fails_ends_with_exit_code_2(sampled, monkeypatch, capsys,
 
 
 def test_the_first_save_of_a_run_promises_nothing(tmp_path, monkeypatch, capsys):
-    """The chain that lies there is another run's."""
+    """The chain that lies there is another run's; ensembles are stored before their first step."""
     save_record(record(camera=0.8), tmp_path / "a.csv")
-    (tmp_path / "study.toml").write_text(STUDY)
+    (tmp_path / "study.toml").write_text(f"{STUDY}ensembles = 2\nwalkers = 8\nsteps = 40\nthin = 1\n")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "chain.h5").write_bytes(b"of another run")
     monkeypatch.setattr(files.os, "fsync", full)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from effectsearch.test_integerplants import HALF, RINGING, based, record
 from small import problem
-from test_alternatives import QUICK
+from test_alternatives import QUICK, few_draws  # noqa: F401
 
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.paper.staticoptics import OpticsPlan
 from lcopa_bayes.results.runfolder import LOCK, locked
@@ -40,10 +42,18 @@ def studies(tmp_path_factory) -> Path:
     return folder
 
 
+def contents(studies: Path, out: Path, *words: str) -> dict:
+    """Of a run that is let end, in this process alone: results do not depend on how many there are."""
+    verb, source, *given, _ = kill.COMMANDS["fleet"]
+    command = [verb, str(studies / source), *given, "--jobs", "1", "--quiet", "--out", str(out), *words]
+    assert main(command) == 0
+    assert [one.name for one in out.rglob("*") if one.name.startswith((".", "tmp"))] == []
+    return kill.contents(out)
+
+
 @pytest.fixture(scope="module")
 def fleet(studies, tmp_path_factory) -> dict:
-    """In one process, as its results do not depend on how many there are."""
-    return kill.reference("fleet", studies, tmp_path_factory.mktemp("runs") / "fleet", jobs=1)[0]
+    return contents(studies, tmp_path_factory.mktemp("runs") / "fleet")
 
 
 @pytest.mark.parametrize(
@@ -56,12 +66,23 @@ def test_a_killed_fleet_goes_on_to_the_same_table(studies, fleet, tmp_path, targ
     assert kill.wait_for(lambda: any(out.rglob("device.json")), 60.0)
     problems, ended = kill.kill(process, target, random.Random(0))
     assert (problems, ended) == ([], False)
-    assert kill.finish("fleet", studies, out, jobs=2, resume=True) == []
-    assert list(kill.differences(kill.contents(out), fleet)) == []
+    assert list(kill.differences(contents(studies, out, "--resume"), fleet)) == []
 
 
-def test_a_run_into_the_folder_of_another_is_refused(studies, tmp_path):
-    assert kill.refused("run", studies, tmp_path / "run", jobs=1) == []
+def test_a_run_into_the_folder_of_another_is_refused(studies, tmp_path, capsys):
+    out = tmp_path / "run"
+    first = kill.start("run", studies, out, jobs=1)
+    try:
+        assert kill.wait_for((out / LOCK).exists, 60.0)
+        os.kill(first.pid, signal.SIGSTOP)
+        assert main(["run", str(studies / "sampled"), "--jobs", "1", "--out", str(out), "--resume"]) == 2
+    finally:
+        os.kill(first.pid, signal.SIGCONT)
+        problems, _ = kill.kill(first, "both", random.Random(0))
+    said = capsys.readouterr().err
+    assert "another run is writing there" in said
+    assert said.count("error") == 1
+    assert problems == []
 
 
 def test_what_a_killed_process_was_writing_is_removed_and_nothing_else(tmp_path):

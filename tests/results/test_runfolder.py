@@ -38,7 +38,8 @@ HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held"
 
 @pytest.fixture(scope="module", params=["white", "student"])
 def fitted(request) -> Fit:
-    return fit(study(*PAIR, held_out=(HELD,), noise=request.param, sampler=TINY, priors={"delay": 0.73}))
+    priors = {"white": {"delay": 0.73}, "student": KNOWN}[request.param]
+    return fit(study(*PAIR, held_out=(HELD,), noise=request.param, sampler=TINY, priors=priors))
 
 
 @pytest.fixture(scope="module")

@@ -184,13 +184,16 @@ def share_reliable(ensembles: int, error: float, trials: int = 100, draws: int =
     return reliable / trials
 
 
-@pytest.mark.parametrize("ensembles", [2, 3, 4, 8])
+@pytest.mark.parametrize("ensembles", [2, 4, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 8))])
 def test_errors_that_an_ensemble_shares_are_rarely_called_reliable(ensembles):
     """0.3 posterior standard deviations each: promised is one in ten, four errors of a share are granted."""
     assert share_reliable(ensembles, 0.3) <= 0.1 + 4 * np.sqrt(0.1 * 0.9 / 100)
 
 
-@pytest.mark.parametrize(("ensembles", "draws"), [(2, 240), (3, 60), (4, 60), (8, 60)])
+@pytest.mark.parametrize(
+    ("ensembles", "draws"),
+    [(2, 240), (4, 60), *(pytest.param(n, 60, marks=pytest.mark.slow) for n in (3, 8))],
+)
 def test_independent_draws_are_nearly_always_called_reliable(ensembles, draws):
     """As many draws as the docstring of the bound promises nine of ten for, and more."""
     share = share_reliable(ensembles, 0.0, draws=draws)
@@ -198,7 +201,7 @@ def test_independent_draws_are_nearly_always_called_reliable(ensembles, draws):
     assert ensembles == 2 or share >= 0.95
 
 
-@pytest.mark.parametrize("ensembles", [2, 4, 8])
+@pytest.mark.parametrize("ensembles", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 8))])
 def test_scatter_of_ensemble_means_is_worth_as_many_draws_as_they_scatter(ensembles):
     """The reciprocal of the effective sample size is without bias: error**2 / ensembles."""
     rng, error, trials = np.random.default_rng(ensembles), 0.2, 400

@@ -157,7 +157,7 @@ KNOWN = {"time_1": 1.5, "order_1": 0.8, "offset": 0.3}
 def checked() -> Fit:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(NestedPlan, "of", lambda *_, **__: NestedPlan(2, 80, 15, 3))
-        return fit(study(record(camera=0.6), sampler=TINY, priors=KNOWN), cross_check=True)
+        return fit(study(record(camera=0.6), sampler=TINY, priors=KNOWN), cross_check=True, quick=True)
 
 
 def test_a_simple_posterior_passes(checked):
@@ -182,7 +182,7 @@ def doubted(checked) -> Fit:
     values[:, k] += 2 * values[:, k].std()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lcopa_bayes.results.fit.nested", lambda *_, **__: replace(honest, values=values))
-        return fit(checked.study, cross_check=True)
+        return fit(checked.study, cross_check=True, quick=True)
 
 
 def test_every_number_of_a_fit_that_is_doubted_is_lowered(checked, doubted):

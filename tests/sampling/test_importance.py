@@ -127,7 +127,9 @@ def test_a_bent_posterior_agrees_with_quadrature(rng):
 
 
 def test_it_agrees_with_the_ensembles_on_a_study():
-    made = problem(record(camera=0.3), noise="ar1", sampler={"ensembles": 2, "walkers": 48})
+    made = problem(
+        record(camera=0.6), noise="ar1", sampler={"ensembles": 2, "walkers": 24, "target_ess": 200}
+    )
     posterior = made.posterior
     found = looked(posterior, 3)
     assert found.good(400)

@@ -28,6 +28,11 @@ def kolmogorov(draws: Vector, at: Vector, exact: Vector) -> float:
     return float(np.abs(share - exact).max())
 
 
+def plan(seed: int) -> SamplePlan:
+    """The first seed is the short form, of half as many effective draws; errors follow their number."""
+    return SamplePlan(2, 48, 2000, 4, 400.0, seed) if seed else SamplePlan(2, 32, 2000, 4, 200.0, seed)
+
+
 # -- several modes ---------------------------------------------------------------------------------
 
 MODES, SHARES, WIDTH = np.array([-6.0, 6.0]), np.array([0.3, 0.7]), 0.5
@@ -44,7 +49,7 @@ def two_modes(z: Matrix) -> Vector:
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
 def test_modes_that_no_step_joins_are_found_in_their_shares(seed):
     toy = Toy(two_modes, {name: ("uniform", {"loc": -15.0, "scale": 30.0}) for name in "ab"})
-    run = sample(toy, SamplePlan(2, 48, 2000, 4, 400.0, seed))
+    run = sample(toy, plan(seed))
     draws, (kept, _) = gather(toy, run), run.kept()
     assert draws.grade.level == "reliable", draws.grade.reason
     right = kept[..., 0] > 0
@@ -90,7 +95,7 @@ def funnel(z: Matrix) -> Vector:
 def test_the_neck_of_a_funnel_is_filled(seed):
     sides = {name: ("uniform", {"loc": -80.0, "scale": 160.0}) for name in "ab"}
     toy = Toy(funnel, {"v": ("uniform", {"loc": ENDS[0], "scale": ENDS[1] - ENDS[0]})} | sides)
-    run = sample(toy, SamplePlan(2, 48, 2000, 4, 400.0, seed))
+    run = sample(toy, plan(seed))
     draws, kept = gather(toy, run), run.kept()[0][..., 0]
     exact = stats.truncnorm(ENDS[0] / MOUTH, ENDS[1] / MOUTH, scale=MOUTH)
     at = np.linspace(*ENDS, 121)
@@ -156,7 +161,7 @@ def test_fractional_calculus_with_integer_orders_is_the_integer_model(name, poin
     likely = exact.ravel() > exact.max() - 12
     ours = posterior.log_likelihood(posterior.values(np.log(grid[likely])))
     np.testing.assert_allclose(ours, exact.ravel()[likely], atol=0.05)
-    run = sample(posterior, SamplePlan(2, 24, 600, 3, 200.0, 4))
+    run = sample(posterior, SamplePlan(2, 16, 400, 3, 120.0, 4))
     draws = gather(posterior, run)
     weights = np.exp(exact - exact.max())
     for k in range(exact.ndim):
@@ -167,7 +172,7 @@ def test_fractional_calculus_with_integer_orders_is_the_integer_model(name, poin
         mean = float(marginal @ axis)
         sd = float(np.sqrt(marginal @ (axis - mean) ** 2))
         count = min(quality.ess, drawn.size)
-        assert count > 150
+        assert count > 100
         assert abs(drawn.mean() - mean) < 4 * sd / np.sqrt(count)
         assert abs(drawn.std() / sd - 1) < 4 / np.sqrt(2 * count)
         edges = axis + (axis[1] - axis[0]) / 2
@@ -206,5 +211,5 @@ def test_a_run_without_correlation_is_a_run_with_white_noise():
     for quality in white.qualities:
         ours, theirs = white.column(quality.name), still.column(quality.name)
         count = min(quality.ess, next(q.ess for q in still.qualities if q.name == quality.name), ours.size)
-        assert count > 150
+        assert count > 100
         assert stats.ks_2samp(ours, theirs).statistic < FAR * np.sqrt(2 / count)

@@ -166,9 +166,11 @@ def whole(proposal: Mixture) -> Product:
     return Product(BOTH, (proposal,))
 
 
-@pytest.mark.parametrize("seeds", [3, pytest.param(6, marks=pytest.mark.slow)])
-def test_a_narrow_mode_beside_a_curved_valley_has_its_share(seeds):
-    """Over seeds: no bias, and the scatter is the reported error."""
+@pytest.mark.slow
+def test_a_narrow_mode_beside_a_curved_valley_has_its_share():
+    """Over seeds: no bias, and the scatter is the reported error. Its short form is that of two groups, which
+    has such a mode in each."""
+    seeds = 6
     first = whole(Mixture(np.ones(1), np.array([[0.0, 1.0]]), 4.0 * np.eye(2)[None]))
     found, errors, evidence = [], [], []
     for seed in range(seeds):
@@ -185,7 +187,7 @@ def test_a_narrow_mode_beside_a_curved_valley_has_its_share(seeds):
     assert low < np.mean(np.square(evidence)) < high
 
 
-@pytest.mark.parametrize("seeds", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_two_groups_are_searched_each_where_the_other_is_likely(seeds):
     """Two valleys with a narrow mode each, from a proposal a tenth of which hits either: shares and evidence
     without bias, and a scatter as reported."""

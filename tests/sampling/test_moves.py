@@ -19,8 +19,10 @@ from lcopa_bayes.sampling.mixturemoves import learned, parts
 from lcopa_bayes.sampling.moves import DifferenceMove, PopulationMove
 from lcopa_bayes.sampling.ridgemoves import moves
 
-WALKERS, COSTLY, ROUNDS = 20_000, 6_000, 60
+WALKERS, COSTLY, ROUNDS = 8_000, 3_000, 50
 """Of most moves, of those that follow a mixture, and moves of each [-]."""
+LONG = 2.5
+"""Times as many in the long form, and where an error must show beyond doubt [-]."""
 NARROW, WIDE = 0.02, 0.15
 """Spreads of the two orders of the population, as on a ridge [-]."""
 GAIN = ("gamma", {"a": 2.0, "scale": 1.0})
@@ -137,7 +139,7 @@ def test_a_move_keeps_the_prior_beside_a_population_on_a_ridge(name, seed, monke
     common (frequencies, an element) may favour no part of the prior.
     """
     walkers = COSTLY if name.startswith("Mixture") else WALKERS
-    end, accepted = moved(made(name), monkeypatch, seed, walkers)
+    end, accepted = moved(made(name), monkeypatch, seed, walkers if seed == 5 else round(LONG * walkers))
     assert accepted > (0.002 if name == "MixtureMove" else 0.1)
     found = surprises(end)
     assert min(found.values()) > 1e-5, (name, found)
@@ -158,5 +160,5 @@ def test_a_move_in_groups_of_coordinates_keeps_the_prior(name, monkeypatch):
 def test_the_prior_is_lost_when_terms_may_cross_in_a_difference(monkeypatch):
     """Steps between sorted points do not lead back where they came from across a crossing."""
     monkeypatch.setattr(DifferenceMove, "crosses", True)
-    found = surprises(moved(made("DifferenceMove"), monkeypatch, 5)[0])
+    found = surprises(moved(made("DifferenceMove"), monkeypatch, 5, round(LONG * WALKERS))[0])
     assert min(found["order_1"], found["order_2"]) < 1e-12

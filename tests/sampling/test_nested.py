@@ -315,7 +315,7 @@ def test_the_evidence_is_of_the_prior_with_decreasing_orders(alike):
 
 def test_seed_and_plan_decide_the_result_and_jobs_do_not():
     reported = {name: TRUTH[name] for name in ("time_1", "order_1", "sigma")}
-    posterior, plan = problem(SHORT, priors=reported).posterior, NestedPlan(2, 40, 10, 1)
+    posterior, plan = problem(SHORT, priors=reported).posterior, NestedPlan(2, 16, 5, 1)
     one, other = nested(posterior, plan), nested(posterior, plan, jobs=2)
     assert_array_equal(one.values, other.values)
     assert one.log_evidence == other.log_evidence

@@ -54,7 +54,7 @@ def run(whole: Posterior) -> Run:
 
 
 def plan(seed: int = 3) -> SamplePlan:
-    return SamplePlan.of(8, seed=seed, method="auto", target_ess=1000)
+    return SamplePlan.of(8, seed=seed, method="auto", target_ess=400)
 
 
 def test_the_density_is_the_product_of_those_of_the_axes(whole: Posterior) -> None:

@@ -82,7 +82,7 @@ def test_they_agree_with_importance_draws_of_the_whole_prior(monkeypatch):
 
 def test_they_end_after_so_many_rounds_and_say_what_they_may_miss(monkeypatch):
     monkeypatch.setattr(sampler, "_NEAR_ROUNDS", 2)
-    own = run(monkeypatch, 1e9)
+    own = run(monkeypatch, 1e9, ensembles=2)
     assert own.ensembles[0].steps == 2 * sampler._ROUND * sampler._NEAR_THIN
     draws = gather(POSTERIOR, own)
     assert draws.grade.level != "reliable"
@@ -93,12 +93,12 @@ def test_they_end_after_so_many_rounds_and_say_what_they_may_miss(monkeypatch):
 
 def test_a_budget_of_time_takes_the_place_of_the_most_rounds(monkeypatch):
     monkeypatch.setattr(sampler, "_NEAR_ROUNDS", 2)
-    assert run(monkeypatch, 1e9, seconds=1e9, steps=120).ensembles[0].steps == 120
+    assert run(monkeypatch, 1e9, seconds=1e9, steps=120, ensembles=2).ensembles[0].steps == 120
 
 
 def test_a_stored_run_remembers_that_it_began_there(monkeypatch, tmp_path):
     monkeypatch.setattr(sampler, "_NEAR_ROUNDS", 2)
-    own, path = run(monkeypatch, 1e9), tmp_path / "chain.h5"
+    own, path = run(monkeypatch, 1e9, ensembles=2), tmp_path / "chain.h5"
     save_chain(path, Chain(own.ensembles), "it")
     assert all(one.near for one in load_chain(path, "it").ensembles)
 

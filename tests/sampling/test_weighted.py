@@ -73,7 +73,7 @@ def test_draws_that_suffice_a_search_are_graded_reliable():
         assert [len(modes.boundaries) for modes in draws.modes] == [2]
 
 
-@pytest.mark.parametrize("count", [100, 400, 3_000])
+@pytest.mark.parametrize("count", [400, *(pytest.param(n, marks=pytest.mark.slow) for n in (100, 3_000))])
 def test_resampling_adds_the_variance_that_is_stated(count):
     """Means of resampled draws about the weighted mean, over 150 sets of draws, whose order decides."""
     rng, stated, errors = np.random.default_rng(1), [], []

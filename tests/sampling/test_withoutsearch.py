@@ -59,7 +59,7 @@ def test_moments_and_evidence_are_those_of_a_grid():
     assert weighted.log_evidence == pytest.approx(logsumexp(density) + np.log(cell), abs=0.1)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 8])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1, 8])
 def test_an_optimum_that_is_none_misleads_nobody(seed):
     """From a narrow surrounding of a draw of the prior: what is delivered is the posterior, or nothing. The
     last seed has points of the prior that are e^709 times as likely as all that was drawn."""

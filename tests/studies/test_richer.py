@@ -33,7 +33,7 @@ def study() -> Study:
 
 @pytest.fixture(scope="module")
 def found() -> Loop:
-    return loop(study(), sample=False)
+    return loop(study(), library=[], sample=False, quick=True)
 
 
 def ends(found: Loop, name: str) -> tuple[float, float]:

@@ -29,8 +29,10 @@ def test_spoiled_records_have_the_size_and_the_units_that_are_asked_for():
     assert np.nanmax(np.ptp(np.nan_to_num(flat.response, nan=flat.response[0, 0]), axis=0)) == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("verb", spoiled.VERBS)
-def test_a_campaign_ends_in_a_result(verb):
+def test_a_campaign_ends_in_a_result(monkeypatch, verb):
+    monkeypatch.setattr(spoiled, "DRAWING", 1.0)
     row = spoiled.play((verb, 120), 405)
     assert row["outcome"] in spoiled.RESULTS[verb]
     assert row["cpu_seconds"] > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +26,15 @@ def fitted():
     return fit(study(record(camera=0.4), held_out=(HELD,), sampler=TINY))
 
 
+@pytest.fixture(scope="module")
+def saved(fitted, tmp_path_factory) -> Path:
+    return fitted.save(tmp_path_factory.mktemp("saved") / "run")
+
+
 @pytest.fixture
-def folder(fitted, tmp_path) -> Path:
-    path = tmp_path / "run"
-    fitted.save(path)
-    return path
+def folder(saved, tmp_path) -> Path:
+    """A copy for each test: many change it."""
+    return Path(shutil.copytree(saved, tmp_path / "run"))
 
 
 def plan(folder: Path, text: str) -> Path:
