@@ -24,7 +24,7 @@ REMEDIES = {
 """What to do about what the system refuses, by its error number."""
 _LONGEST = 100
 """Letters of a file's name that a message shows."""
-_LISTED = 20
+_LISTED = 40
 """Known words that a message lists."""
 
 
