@@ -25,6 +25,8 @@ _SEEN = float(norm.sf(5.0))
 """p-value of noise alone below which error beyond noise is judged, five normal standard deviations [-]."""
 _PROCESSES = 400
 """Noise processes over which that p-value is averaged [-]."""
+_LARGEST = 0.05
+"""Share of simulated errors that the law of their tail is fitted to [-]."""
 _SEED = 9
 
 
@@ -59,7 +61,7 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
 
     Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
     is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation
-    (an error beyond all simulated ones by their mean and variance); their geometric mean, at most e times too
+    (an error beyond all simulated ones by the tail of these); their geometric mean, at most e times too
     small whatever their dependence (Vovk and Wang 2020, Biometrika 107), is multiplied by the number of axes.
     """
     if not study.held_out and state.whitening.dependence:
@@ -121,7 +123,7 @@ def _missed(
     reached = chance >= seen[:, None, None]
     shares = (1 + reached.sum(axis=(1, 2))) / (1 + reached[0].size)
     if not reached[0].any():  # the number of draws must not decide how improbable it is
-        shares[0] = min(shares[0], _beyond(seen[0], chance[0].mean(), chance[0].var()))
+        shares[0] = min(shares[0], _tail(chance[0].ravel(), seen[0]))
     ratio, coverage = np.sqrt(seen[0] / count) / sd, 1 - seen[1] / count
     return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))), beyond)
 
@@ -129,6 +131,24 @@ def _missed(
 def _error_and_misses(errors: Array, half_width: Vector) -> Array:
     """Squared error [response unit^2], and samples outside the band [-], of errors (..., n), (2, ...)."""
     return np.stack([(errors**2).sum(axis=-1), (np.abs(errors) > half_width).sum(axis=-1)])
+
+
+def _tail(simulated: Vector, reached: float) -> float:
+    """Probability of what lies beyond all simulated values, by a generalised Pareto law of the largest [-].
+
+    Its shape is that of their mean and variance (Hosking and Wallis 1987, Technometrics 29), and no less than
+    that of an exponential tail, so that tails of heavy noise remain heavy.
+    """
+    ordered = np.sort(simulated)
+    count = max(2, int(_LARGEST * ordered.size))
+    excess, x = ordered[-count:] - ordered[-count - 1], reached - ordered[-count - 1]
+    mean, variance = excess.mean(), excess.var()
+    if not variance:
+        return 1.0 / (1 + ordered.size)
+    shape = max(0.0, 0.5 * (1 - mean**2 / variance))
+    scale = mean * (1 - shape)
+    log_share = -np.log1p(shape * x / scale) / shape if shape else -x / scale
+    return float(count / ordered.size * np.exp(log_share))
 
 
 def _beyond(power: float, mean: Vector | float, variance: Vector | float) -> Vector:
@@ -149,7 +169,7 @@ class _Residual:
     rho: float
     """Correlation one sampling period apart that gives as many independent samples [-]."""
     independent: float
-    """Independent samples [-]."""
+    """Independent normal samples that know its variance as well [-]."""
     period: float
     """Sampling period [time unit]."""
 
@@ -162,8 +182,9 @@ class _Residual:
         known = joint_noise(pieces, posterior.table.layout.responses[axis], "", scales)
         law = Law.of(known.posterior)
         white = np.concatenate([law.whiten(piece.values, piece.gaps)[1:] for piece in pieces])
+        white /= white.std()
         rho = np.sqrt((known.dependence - 1) / (known.dependence + 1))
-        return cls(white / white.std(), float(rho), known.samples / known.dependence, scales.period)
+        return cls(white, float(rho), _independent(white, known.samples / known.dependence), scales.period)
 
     def draw(self, sd: float, times: Vector, count: int, rng: np.random.Generator) -> Matrix:
         """Noise of about that `sd` [response unit], known from so many independent samples, (count, n)."""
@@ -172,6 +193,14 @@ class _Residual:
         out[:, 1:] *= np.sqrt(1 - link**2)
         scale = sd * np.sqrt(self.independent / rng.chisquare(self.independent, count))
         return scale[:, None] * correlated(out, link[None])
+
+
+def _independent(innovations: Vector, samples: float) -> float:
+    """Normal samples that know their variance as well as so many samples of the law of innovations [-].
+
+    The variance of a sample variance is ``kurtosis - 1`` over the samples, of normal ones 2.
+    """
+    return samples / max(1.0, 0.5 * (float(np.mean(innovations**4)) - 1))
 
 
 @final

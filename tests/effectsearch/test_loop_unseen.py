@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.stats import binom
 from test_loop_joint import AXIS, walked
 
@@ -16,7 +17,7 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.findings import Side, astray
-from lcopa_bayes.effectsearch.heldouteffects import missed
+from lcopa_bayes.effectsearch.heldouteffects import _independent, _tail, missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.scores import State, risen
 from lcopa_bayes.effectsearch.verdict import CHANCE, RISEN
@@ -98,6 +99,38 @@ def test_errors_that_chance_does_not_reach_are_missed(kind, factor):
     assert away.ratio == pytest.approx(factor * near.ratio)
     assert not near.significant
     assert away.significant
+
+
+@pytest.mark.parametrize(
+    ("law", "least", "most"),
+    [(stats.expon(), 0.02, 50.0), (stats.chi2(40), 0.02, 1e3), (stats.genpareto(0.3), 0.05, 1e3)],
+)
+def test_beyond_all_draws_probabilities_are_those_of_the_law(law, least, most):
+    """Of an exponential tail, one that falls faster and is taken for exponential, and a heavy one.
+
+    Its shape is known to 0.1 by 80 draws: at a probability of 1e-5 to a factor of 10, in the median over 40
+    sets nearer.
+    """
+    reached = float(law.isf(1e-5))
+    sets = (law.rvs(1600, random_state=seed) for seed in range(40))
+    found = np.median([_tail(one, reached) for one in sets if one.max() < reached])
+    assert least < found / 1e-5 < most
+
+
+@pytest.mark.parametrize(("law", "times"), [(stats.norm, 1.0), (stats.laplace, 2.5), (stats.uniform, 1.0)])
+def test_heavy_noise_knows_its_variance_less_well(law, times):
+    """The variance of sample variances of 50 samples, over that of normal ones, by simulation; lighter noise
+    than normal is taken for normal."""
+    noise = law.rvs(size=(4000, 50), random_state=2)
+    noise = (noise - noise.mean()) / noise.std()
+    known = _independent(noise.ravel(), 50.0)
+    assert known == pytest.approx(50.0 / times, rel=0.1)
+    simulated = 2.0 / np.var((noise**2).mean(axis=1))
+    assert known == pytest.approx(min(50.0, simulated), rel=0.15)
+
+
+def test_of_equal_draws_no_tail_is_known():
+    assert _tail(np.ones(99), 2.0) == pytest.approx(0.01)
 
 
 def test_an_error_that_no_draw_reaches_is_the_less_probable_the_larger_it_is():
