@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 from scipy import stats
-from scipy.special import betainc, betaincc, gammaln, xlog1py, xlogy
+from scipy.special import bdtr, bdtrc, gammaln, xlog1py, xlogy
 
 from lcopa_bayes.core.arrays import Array, Index, Vector
 from lcopa_bayes.core.estimate import attributes
@@ -122,14 +122,12 @@ def _leaving(replicas: int, values: int, inside: Limits) -> float:
 
 def _fewer(count: Index, of: Index, share: float) -> Vector:
     """Binomial probability of fewer than `count`; that of `scipy.stats`, without its checks of every call."""
-    inner = betaincc(np.clip(count, 1, None), np.clip(of - count + 1, 1, None), share)
-    return np.select([count <= 0, count > of], [0.0, 1.0], inner)
+    return np.where(count <= 0, 0.0, bdtr(np.clip(count - 1, 0, of), of, share))
 
 
 def _more(count: Index, of: Index, share: float) -> Vector:
     """Binomial probability of more than `count`."""
-    inner = betainc(np.clip(count + 1, 1, None), np.clip(of - count, 1, None), share)
-    return np.select([count < 0, count >= of], [1.0, 0.0], inner)
+    return np.where(count < 0, 1.0, bdtrc(np.clip(count, 0, of), of, share))
 
 
 BAND = "Clopper-Pearson"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2, genpareto, norm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.study import Study
@@ -147,8 +147,7 @@ def _tail(simulated: Vector, reached: float) -> float:
         return 1.0 / (1 + ordered.size)
     shape = max(0.0, 0.5 * (1 - mean**2 / variance))
     scale = mean * (1 - shape)
-    log_share = -np.log1p(shape * x / scale) / shape if shape else -x / scale
-    return float(count / ordered.size * np.exp(log_share))
+    return float(count / ordered.size * genpareto.sf(x, shape, scale=scale))
 
 
 def _beyond(power: float, mean: Vector | float, variance: Vector | float) -> Vector:

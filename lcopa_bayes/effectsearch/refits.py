@@ -323,3 +323,10 @@ def evidence_over(start: State, state: State, quiet: float) -> tuple[float, floa
         plain = Regression(start.model, state.whitening).descend(start.optimum.x)
     gained = log_bayes_factor(plain, state.optimum, quiet) + paid(state.model) - paid(start.model)
     return gained, plain.cost - state.optimum.cost
+
+
+def beside_others(state: State, name: str, quiet: float) -> Refit:
+    """One effect of a model as the last that was added: against the model refitted without it."""
+    model, x = without(state.model, state.optimum.x, [name])
+    fewer = Regression(model, state.whitening).descend(x, most=12, gain=0.02)
+    return Refit(state.model, state.optimum, fewer, state.whitening, (name,), quiet)

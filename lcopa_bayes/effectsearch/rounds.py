@@ -16,10 +16,10 @@ from lcopa_bayes.effectsearch.effectpairs import both, paired
 from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
     Refit,
+    beside_others,
     evidence_over,
     log_bayes_factor,
     paid,
-    without,
 )
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
@@ -179,8 +179,8 @@ def search(
         rounds[-2:] = [replace(rounds[-2], chosen=None)]
     unnamed = any(effect.card.dynamics for effect in rounds[-1].state.model.effects)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
-        paired, confounded = _pair(rounds[0], rounds[-1].state, looking, better, crew)
-        rounds, groups = rounds + paired, confounded if paired else groups
+        further, confounded = _pair(rounds[0], rounds[-1].state, looking, better, crew)
+        rounds, groups = rounds + further, confounded if further else groups
     return Search.ending(rounds, groups)
 
 
@@ -247,12 +247,12 @@ def _pair(
     pair = paired(first.state, state, first.trace)
     if pair is None:
         return [], {}
-    look, kept = looking(in_proportion(pair.state)), pair
-    if look.alarmed:
-        one_or_both = both(first.state, state, pair, better)
-        if one_or_both is None:
-            return [], {}
-        look, kept = (look if one_or_both is pair else looking(in_proportion(one_or_both.state))), one_or_both
+    look = looking(in_proportion(pair.state))
+    kept = both(first.state, state, pair, better) if look.alarmed else pair
+    if kept is None:
+        return [], {}
+    if kept is not pair:
+        look = looking(in_proportion(kept.state))
     return [replace(first, refits=(kept,), failures=(), chosen=kept), look], _groups(kept, looking, crew)
 
 
@@ -260,26 +260,20 @@ def _groups(chosen: Refit, looking: Callable[[State], Round], crew: Crew) -> dic
     """Names that each of several effects which were added at once is confounded with beside the others."""
     groups, white = {}, chosen.whitening
     for name in chosen.added:
-        model, x = chosen.without([name])
-        fewer = Regression(model, white).descend(x, most=12, gain=0.02)
-        alone = replace(chosen, before=fewer, added=(name,), choice=0.0)
+        alone = beside_others(chosen.state, name, chosen.quiet)
         crew.stage(f"refitting with each effect that may stand for {name}")
-        look = looking(State(model, fewer, white)).refitted(crew, alone.log_bayes_factor)
+        fewer = State(alone.without([name])[0], alone.before, white)
+        look = looking(fewer).refitted(crew, alone.log_bayes_factor)
         refits = [one.under(white) for one in look.refits] if white.dependence else look.refits
-        groups[name] = group(look.state, alone, refits, look.trace)
+        groups[name] = group(fewer, alone, refits, look.trace)
     return groups
 
 
 def _beside_others(state: State, quiet: float) -> list[float]:
     """Log evidence that each of several effects brings beside the others [nat]: one of a pair may bring
     all."""
-    worth = []
-    for effect in state.model.effects if len(state.model.effects) > 1 else ():
-        model, x = without(state.model, state.optimum.x, [effect.name])
-        fewer = Regression(model, state.whitening).descend(x, most=12, gain=0.02)
-        own = paid(state.model, [effect.name])
-        worth.append(log_bayes_factor(fewer, state.optimum, quiet) + own)
-    return worth
+    several = state.model.effects if len(state.model.effects) > 1 else ()
+    return [beside_others(state, effect.name, quiet).log_bayes_factor for effect in several]
 
 
 def _kept(candidate: Refit) -> State:
