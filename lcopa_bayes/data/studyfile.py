@@ -28,7 +28,9 @@ _TABLES = ("study", "records", "priors", "stages", "candidates", *TABLES)
 def _read(
     fit: Sequence[Path], held_out: Sequence[Path], time_unit: str | None, problems: list[str]
 ) -> dict[str, list[Record]]:
-    """Records by role, in `time_unit` or that of the first; what is wrong joins `problems`."""
+    """Records by role, in `time_unit` or that of the first; what is wrong joins `problems`, which may hold
+    what is wrong with others."""
+    complete = not problems
     records: dict[str, list[Record]] = {"fit": [], "held_out": []}
     listed: dict[Path, str] = {}
     for role, path in [*(("fit", path) for path in fit), *(("held_out", path) for path in held_out)]:
@@ -42,7 +44,7 @@ def _read(
             problems += error.problems
         else:
             time_unit = time_unit or records[role][0].time_unit
-    problems += together(*records.values(), complete=len(records["fit"]) == len(fit))
+    problems += together(*records.values(), complete=complete and len(records["fit"]) == len(fit))
     return records
 
 
@@ -90,18 +92,17 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     heading = settings_from(HeadingSettings, document.get("study", {}), where("study"), problems)
     named = settings_from(RecordsSettings, document.get("records", {}), where("records"), problems)
     heading, fit, apart = heading or HeadingSettings(), [], held_out
+    of_records: list[str] = []  # or of code: with these nothing more can be checked
     if named:
-        apart = [*(folder / name for name in named.held_out), *held_out]
+        apart = [*_inside(folder, named.held_out, where("records"), of_records), *held_out]
         kept = {file.resolve() for file in apart}
         beside = [file for file in tables_in(folder) if file.resolve() not in kept]
-        fit = [folder / k for k in named.fit or ()] or beside
-        names = [*(named.fit or [file.name for file in beside]), *named.held_out]
-        refuse_if([f"{where('records')}: {one}" for one in outside(folder, names)])
-        if not fit:
+        names = named.fit or [file.name for file in beside]
+        fit = _inside(folder, names, where("records"), of_records)
+        if not names:
             problems.append(
                 f"{where('records')}: no record to fit; name one, or put one beside the study file"
             )
-    of_records: list[str] = []
     records = _read(fit, apart, heading.time_unit, of_records)
     priors, used = document.get("priors"), [path]
     if isinstance(priors, Mapping) and "from" in priors:
@@ -112,7 +113,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
             used.append(population)
     settings = study_settings(document, where, problems)
     if settings["effects"] is not None:
-        refuse_code(where("effects"), settings["effects"].add)
+        with gathered(of_records):
+            refuse_code(where("effects"), settings["effects"].add)
     problems += of_records
     plant = all(settings[key] is not None for key in ("model", "noise", "effects"))
     if problems and not (plant and records["fit"] and not of_records):
@@ -131,6 +133,13 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     if problems:
         raise BrokenStudyError(problems, study)
     return study
+
+
+def _inside(folder: Path, names: Sequence[str], where: str, problems: list[str]) -> list[Path]:
+    """Files of a folder; those outside it are not read, and join the problems."""
+    wrong = {name: [f"{where}: {one}" for one in outside(folder, [name])] for name in names}
+    problems += [one for own in wrong.values() for one in own]
+    return [folder / name for name in names if not wrong[name]]
 
 
 def tables_in(folder: Path) -> list[Path]:

@@ -140,6 +140,23 @@ def test_files_outside_the_folder_are_read_of_a_trusted_study_alone(tmp_path, ca
         assert lb.load_study(folder, trust=True).fit
 
 
+def test_all_else_that_is_wrong_is_said_with_the_files_that_are_outside(stranger, capsys):
+    """A file outside, code, a misspelt key and a faulty record: none hides another, and the file outside is
+    not read."""
+    secret = stranger.parent / "secret.csv"
+    secret.write_text("top secret\n")
+    (stranger / "faulty.csv").write_text("time_ms,drive_x_V,response_x_um\n0,0,0\n1,one,0\n2,1,1\n")
+    text = (stranger / "study.toml").read_text()
+    records = '[records]\nfit = ["faulty.csv", "../secret.csv"]\n[sampler]\nwalker = 20\n'
+    (stranger / "study.toml").write_text(text + records)
+    assert main(["check", str(stranger), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    for one in ("'../secret.csv' is not inside", "would run code", "'walker'", "faulty.csv, line 3"):
+        assert one in said
+    assert f"{secret}:" not in said
+    assert not (stranger / "executed").exists()
+
+
 def test_files_inside_the_folder_need_no_trust(tmp_path):
     folder = tmp_path / "real"
     (folder / "data").mkdir(parents=True)
