@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Vector
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.whitening import parts
 from lcopa_bayes.inference.observations import Samples
 

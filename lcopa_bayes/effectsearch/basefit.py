@@ -11,13 +11,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import (
-    AxisNoise,
-    Law,
-    axis_noise,
-    joint_noise,
-    plausible,
-)
+from lcopa_bayes.effectsearch.noise import AxisNoise, axis_noise, joint_noise
+from lcopa_bayes.effectsearch.noiselaw import Law, plausible
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
 from lcopa_bayes.inference.defaultpriors import Scales

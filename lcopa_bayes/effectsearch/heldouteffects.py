@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Self, final
 
 import numpy as np
 from scipy.stats import chi2, genpareto, norm
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Vector
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
-from lcopa_bayes.effectsearch.noise import Law, joint_noise, laws
+from lcopa_bayes.effectsearch.noiselaw import Law, laws
+from lcopa_bayes.effectsearch.residualnoise import ResidualNoise
 from lcopa_bayes.effectsearch.scores import Score, State, pooled_rmse
 from lcopa_bayes.effectsearch.verdict import Miss
-from lcopa_bayes.inference.recursions import correlated
 
 _ROOM = 0.05
 """Share of the range of a drive beyond which a model extrapolates [-]."""
-_REPEATS = 4
-"""Draws of noise beside each draw of a prediction [-]."""
+_SIMULATED = 400
+"""Errors that are simulated, with the draws of a prediction by turns [-]."""
 _SEEN = float(norm.sf(5.0))
 """p-value of noise alone below which error beyond noise is judged, five normal standard deviations [-]."""
 _PROCESSES = 400
@@ -60,22 +59,19 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     there, beyond it, where errors have twice the p-value.
 
     Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
-    is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation
-    (an error beyond all simulated ones by the tail of these); their geometric mean, at most e times too
-    small whatever their dependence (Vovk and Wang 2020, Biometrika 107), is multiplied by the number of axes.
+    is found in it, and what the fit leaves uncertain under it. Error and coverage have a p-value each by
+    simulation (an error beyond all simulated ones by the tail of these); their geometric mean, at most e
+    times too small whatever their dependence (Vovk and Wang 2020, Biometrika 107), is multiplied by the
+    number of axes.
     """
     if not study.held_out and state.whitening.dependence:
         return None  # the residual was taken for noise, and errors of records left out are little else
     names = [axis.name for axis in study.response_axes]
     own = {axis: [one for one in scores if one.axis == axis and one.draws is not None] for axis in names}
+    known = {axis: _Known.of(fit, own[axis], state, k) for k, axis in enumerate(names) if own[axis]}
 
     def least(*, beyond: bool) -> Miss | None:
-        rng = np.random.default_rng(_SEED)
-        each = [
-            _missed(study, fit, own[axis], state, k, rng, beyond=beyond)
-            for k, axis in enumerate(names)
-            if own[axis]
-        ]
+        each = [one.missed(study, own[axis], beyond=beyond) for axis, one in known.items()]
         judged = [one for one in each if one is not None]
         chosen = min(judged, key=lambda one: one.p, default=None)
         return chosen and replace(chosen, p=min(1.0, chosen.p * len(judged)))
@@ -91,41 +87,45 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     return beyond if beyond.significant or (beyond.far and within) else inside
 
 
-def _missed(
-    study: Study,
-    fit: Sequence[Score],
-    scores: Sequence[Score],
-    state: State,
-    axis: int,
-    rng: np.random.Generator,
-    *,
-    beyond: bool,
-) -> Miss | None:
-    masks = [(one.time >= _left(study, one.record)) == beyond for one in scores]
-    if not any(mask.any() for mask in masks):
-        return None
-    name = study.response_axes[axis].name
-    sd, noise = max(pooled_rmse(fit, name), scores[0].noise_sd), _Residual.of(state, axis)
-    # samples that are weighted alike count by the power of their noise; means of it scatter more
-    slow = (1 + noise.rho) / np.sqrt(1 + noise.rho**2) if state.whitening.dependence else 1.0
-    followed = np.concatenate([one.variance for one in fit if one.axis == name]).mean()  # noise, by the fit
-    full = float(np.hypot(sd, slow * np.sqrt(followed)))
-    seen, chance, count = np.zeros(2), np.zeros((2, 1, 1)), 0
-    for one, counted in zip(scores, masks, strict=True):
-        if not counted.any():
-            continue
-        assert one.draws is not None
-        error, draws = (one.observed - one.predicted)[counted], slow * one.draws[:, counted]
-        drawn = np.stack([noise.draw(full, one.time[counted], len(draws), rng) for _ in range(_REPEATS)])
-        half = one.half_width[counted]
-        seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn + draws, half)
-        count += error.size
-    reached = chance >= seen[:, None, None]
-    shares = (1 + reached.sum(axis=(1, 2))) / (1 + reached[0].size)
-    if not reached[0].any():  # the number of draws must not decide how improbable it is
-        shares[0] = min(shares[0], _tail(chance[0].ravel(), seen[0]))
-    ratio, coverage = np.sqrt(seen[0] / count) / sd, 1 - seen[1] / count
-    return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))), beyond)
+@final
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known of the noise of one axis."""
+
+    axis: str
+    sd: float
+    """Of the residual, that of quiet samples at least [response unit]."""
+    noise: ResidualNoise
+
+    @classmethod
+    def of(cls, fit: Sequence[Score], scores: Sequence[Score], state: State, axis: int) -> Self:
+        noise = ResidualNoise.of(state, axis, _SIMULATED, np.random.default_rng([_SEED, axis]))
+        name = scores[0].axis
+        return cls(name, max(pooled_rmse(fit, name), scores[0].noise_sd), noise)
+
+    def missed(self, study: Study, scores: Sequence[Score], *, beyond: bool) -> Miss | None:
+        """Errors inside the drive range of the other records, or beyond it; None without a sample there."""
+        rng = np.random.default_rng(_SEED)
+        seen, chance, count = np.zeros(2), np.zeros((2, 1)), 0
+        for one in scores:
+            counted = (one.time >= _left(study, one.record)) == beyond
+            if not counted.any():
+                continue
+            assert one.draws is not None
+            error, half = (one.observed - one.predicted)[counted], one.half_width[counted]
+            drawn = self.noise.draw(one.time[counted], rng)
+            by_turns = np.arange(_SIMULATED) % len(one.draws)
+            drawn += self.noise.widening[:, None] * one.draws[by_turns][:, counted]
+            seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn, half)
+            count += error.size
+        if not count:
+            return None
+        reached = chance >= seen[:, None]
+        shares = (1 + reached.sum(axis=1)) / (1 + reached[0].size)
+        if not reached[0].any():  # the number of draws must not decide how improbable it is
+            shares[0] = min(shares[0], _tail(chance[0], seen[0]))
+        ratio, coverage = np.sqrt(seen[0] / count) / self.sd, 1 - seen[1] / count
+        return Miss(self.axis, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))), beyond)
 
 
 def _error_and_misses(errors: Array, half_width: Vector) -> Array:
@@ -156,50 +156,6 @@ def _beyond(power: float, mean: Vector | float, variance: Vector | float) -> Vec
     Each is nearly a multiple of chi-squared with the same mean and variance (Box 1954, Ann. Math. Stat. 25).
     """
     return np.asarray(chi2.sf(2 * power * mean / variance, 2 * mean**2 / variance))
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Residual:
-    """Noise as the residual of a fit has it on one axis: its memory and its tails."""
-
-    innovations: Vector
-    """What the past does not predict of it, of variance 1, (n,) [-]."""
-    rho: float
-    """Correlation one sampling period apart that gives as many independent samples [-]."""
-    independent: float
-    """Independent normal samples that know its variance as well [-]."""
-    period: float
-    """Sampling period [time unit]."""
-
-    @classmethod
-    def of(cls, state: State, axis: int) -> _Residual:
-        """From the fitted records."""
-        posterior = state.model.plant
-        scales = fitted_scales(posterior)
-        pieces = axis_pieces(posterior, state.optimum.residual, axis)
-        known = joint_noise(pieces, posterior.table.layout.responses[axis], "", scales)
-        law = Law.of(known.posterior)
-        white = np.concatenate([law.whiten(piece.values, piece.gaps)[1:] for piece in pieces])
-        white /= white.std()
-        rho = np.sqrt((known.dependence - 1) / (known.dependence + 1))
-        return cls(white, float(rho), _independent(white, known.samples / known.dependence), scales.period)
-
-    def draw(self, sd: float, times: Vector, count: int, rng: np.random.Generator) -> Matrix:
-        """Noise of about that `sd` [response unit], known from so many independent samples, (count, n)."""
-        link = self.rho ** (np.diff(times) / self.period)
-        out = rng.choice(self.innovations, (count, times.size))
-        out[:, 1:] *= np.sqrt(1 - link**2)
-        scale = sd * np.sqrt(self.independent / rng.chisquare(self.independent, count))
-        return scale[:, None] * correlated(out, link[None])
-
-
-def _independent(innovations: Vector, samples: float) -> float:
-    """Normal samples that know their variance as well as so many samples of the law of innovations [-].
-
-    The variance of a sample variance is ``kurtosis - 1`` over the samples, of normal ones 2.
-    """
-    return samples / max(1.0, 0.5 * (float(np.mean(innovations**4)) - 1))
 
 
 @final

@@ -17,12 +17,12 @@ from scipy.signal import correlate
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.effectsearch.noiselaw import Law, laws, plausible
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples, mixed_shapes
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 
 FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
@@ -39,84 +39,12 @@ _ALIKE = 1e-3
 _REPEATED = 200
 """Plausible noise laws over which a number is averaged [-]."""
 _SEED = 5
-_CORRELATIONS = 120
-"""Correlations of noise without a white part that are tried [-]."""
 _SEEN = 0.02
 """Part of the power at which a correlation is mentioned [-]."""
 _SHARES = (1e-3, 5e-3, 3e-2)
 """Shares of outliers tried [-]."""
 _WIDTHS = (6.0, 30.0)
 """Standard deviations of an outlier over that of the noise tried [-]."""
-
-
-@final
-@dataclass(frozen=True)
-class Law:
-    """Stationary white noise plus a correlated part; either may vanish."""
-
-    sigma: float
-    """Standard deviation of the white part [response unit]."""
-    sigma_ar: float = 0.0
-    """Standard deviation of the correlated part [response unit]."""
-    rho: float = 0.0
-    """Its correlation one sampling period apart [-]."""
-
-    @classmethod
-    def of(cls, posterior: PlausibleNoise) -> Law:
-        """The likeliest."""
-        return cls(*posterior.estimate.tolist())
-
-    @property
-    def parameters(self) -> Vector:
-        """As `WhiteAR1` takes them, (3,)."""
-        return np.array([self.sigma, self.sigma_ar, self.rho])
-
-    @property
-    def sd(self) -> float:
-        """Standard deviation [response unit]."""
-        return float(np.hypot(self.sigma, self.sigma_ar))
-
-    @property
-    def share(self) -> float:
-        """Correlated part of the power [-]."""
-        return (self.sigma_ar / self.sd) ** 2
-
-    def whiten(self, columns: Array, gaps: Vector) -> Array:
-        """Standardised prediction errors of columns (..., n), same shape [-]; `gaps` in sampling periods."""
-        flat = columns.reshape(1, -1, gaps.size)
-        return np.reshape(WhiteAR1().whiten(flat, self.parameters[None], gaps)[0], columns.shape)
-
-    def correlated(self, lags: int) -> float:
-        """Samples of a long stretch that count as one independent sample of a power [-], 1 or more.
-
-        ``1 + 2 sum_k rho_k^2`` (Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the
-        autocorrelation at lag k, summed over `lags` lags with weights ``1 - k / (lags + 1)``: the mean
-        square of ``lags + 1`` samples scatters as that of so many times fewer independent ones.
-        """
-        k = np.arange(1, lags + 1)
-        squares = self.share**2 * self.rho ** (2.0 * k)
-        return float(1.0 + 2.0 * ((1.0 - k / (lags + 1)) * squares).sum())
-
-
-def plausible(pieces: Sequence[Observed], scales: Scales) -> PlausibleNoise:
-    """Posterior of the noise given pieces of it; one of a single sample says nothing.
-
-    To equal parts noise of a single correlation, under Jeffreys' prior ``1 / sqrt(1 - rho^2)`` (Berger and
-    Yang 1994, Econometric Theory 10; under a flat one noise of correlation near 1 raises more alarms than
-    stated), and white noise with a correlated part that a record holds twenty times, as a fit has it.
-    """
-    single = np.sin(0.5 * np.pi * (np.arange(_CORRELATIONS) + 0.5) / _CORRELATIONS)
-    alone = np.column_stack([np.zeros_like(single), np.ones_like(single), single])
-    mixed, log_prior = mixed_shapes(scales.correlations)
-    log_prior -= np.log(np.exp(log_prior).sum())
-    even = np.full(_CORRELATIONS, -np.log(_CORRELATIONS))
-    pieces = [piece for piece in pieces if piece.values.size > 1]
-    return PlausibleNoise.of(pieces, np.vstack([alone, mixed]), np.concatenate([even, log_prior]))
-
-
-def laws(drawn: Matrix) -> list[Law]:
-    """Drawn parameters, (draws, 3), one by one."""
-    return [Law(*row) for row in drawn.tolist()]
 
 
 @final

@@ -12,7 +12,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import HALF_WIDTH, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.noise import Noise

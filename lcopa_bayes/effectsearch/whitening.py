@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law, own_correlation
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 from lcopa_bayes.inference.recursions import Filter
@@ -18,8 +18,6 @@ from lcopa_bayes.inference.recursions import Filter
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
 _SEED = 7
-_SHORTER = 0.5
-"""Share of the likeliest law's memory below which a residual's own is another [-]."""
 
 
 @final
@@ -145,27 +143,30 @@ class Whitening:
         back, k = self.adjoint(columns.T), columns.shape[1]
         rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
         for axis in range(len(self.posterior)):
-            drawn = self._plausible(axis, count, rng)
-            rho, which = np.unique(drawn[:, 2], return_inverse=True)
-            white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
-            for part in parts(self.samples, axis):
-                white += back[:, part.rows] @ back[:, part.rows].T
-                correlated += _correlated_products(back[:, part.rows], rho, part.observed.gaps)
-            out += drawn[:, 0, None, None] ** 2 * white
-            out += drawn[:, 1, None, None] ** 2 * correlated[which]
+            out += self.products_under(self._plausible(axis, count, rng), back, axis)
         return out
 
-    def _plausible(self, axis: int, count: int, rng: np.random.Generator) -> Matrix:
-        """Plausible laws of an axis, as `WhiteAR1` takes them, (count, 3).
+    def products_under(self, laws: Matrix, back: Matrix, axis: int) -> Array:
+        """Covariance of products of the noise of one axis with columns (k, n), under laws (count, 3) as
+        `WhiteAR1` takes them, (count, k, k)."""
+        rho, which = np.unique(laws[:, 2], return_inverse=True)
+        k = len(back)
+        white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
+        for part in parts(self.samples, axis):
+            white += back[:, part.rows] @ back[:, part.rows].T
+            correlated += _correlated_products(back[:, part.rows], rho, part.observed.gaps)
+        return np.asarray(
+            laws[:, 0, None, None] ** 2 * white + laws[:, 1, None, None] ** 2 * correlated[which]
+        )
 
-        From sample to sample a smooth misfit looks like a random walk. Where its own autocorrelations sum up
-        to less than those of the likeliest law, that law is used whose ``sum_k rho^2k = (1 + rho^2) / (1 -
-        rho^2)`` has their sum.
-        """
+    def _plausible(self, axis: int, count: int, rng: np.random.Generator) -> Matrix:
+        """Plausible laws of an axis, as `WhiteAR1` takes them, (count, 3); none remembers longer than the
+        residual's own memory (`own_correlation`)."""
         own = self.dependence[axis] if self.dependence else np.inf
-        if own >= _SHORTER * Law.of(self.posterior[axis]).correlated(self.size):
+        rho = own_correlation(own, Law.of(self.posterior[axis]), self.size)
+        if rho is None:
             return self.posterior[axis].draw(count, rng)
-        return np.tile([0.0, self.noise[axis].sd, np.sqrt((own - 1) / (own + 1))], (count, 1))
+        return np.tile([0.0, self.noise[axis].sd, rho], (count, 1))
 
     @cached_property
     def effective(self) -> float:

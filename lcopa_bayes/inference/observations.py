@@ -192,8 +192,8 @@ class QuietNoise:
 class PlausibleNoise:
     """Posterior of `WhiteAR1` given pieces of it, over a grid of shares and correlations.
 
-    Flat priors of the level of each piece and of the logarithm of the standard deviation, both integrated out
-    in closed form.
+    Flat priors of the level of each piece, or of what else was fitted to them, and of the logarithm of the
+    standard deviation, all integrated out in closed form.
     """
 
     shapes: Matrix
@@ -203,8 +203,8 @@ class PlausibleNoise:
     """Probability of each, (grid,) [-]."""
     squares: Vector
     """Squares of the whitened pieces about their levels under each, (grid,) [response unit^2]."""
-    count: int
-    """Samples less one level for each piece [-]."""
+    count: float
+    """Samples less one for each level or coefficient that was fitted to them, one at least [-]."""
 
     @classmethod
     def of(cls, pieces: Sequence[Observed], shapes: Matrix, log_prior: Vector) -> PlausibleNoise:
@@ -214,13 +214,50 @@ class PlausibleNoise:
             raise ValueError("a noise scale needs a piece of two samples or more")
         level, squares = np.zeros(len(shapes)), np.zeros(len(shapes))
         for piece in pieces:
-            portions = np.array_split(
-                np.arange(len(shapes)), max(1, len(shapes) * piece.values.size // _CELLS)
-            )
-            parts = [_about_own_level(piece, shapes[portion]) for portion in portions if portion.size]
+            portions = _portions(len(shapes), piece.values.size)
+            parts = [_about_own_level(piece, shapes[portion]) for portion in portions]
             level += np.concatenate([one[0] for one in parts])
             squares += np.concatenate([one[1] for one in parts])
-        weight = level - 0.5 * count * np.log(squares) + log_prior
+        return cls._weighed(shapes, level + log_prior, squares, count)
+
+    @classmethod
+    def of_residual(
+        cls,
+        pieces: Sequence[tuple[Observed, Matrix]],
+        precision: Matrix,
+        shapes: Matrix,
+        log_prior: Vector,
+    ) -> PlausibleNoise:
+        """From residuals of a linear fit and the regressors of its coefficients, (n, k) each: the restricted
+        likelihood (Patterson and Thompson 1971, Biometrika 58), which knows what a fit takes up of slow
+        noise.
+
+        `precision`, (k, k), is what is known of the coefficients besides, times the variance of the noise;
+        each has to be determined by it or by the pieces.
+        """
+        k = len(precision)
+        size = 1 / np.sqrt(np.diag(precision) + sum(np.square(own).sum(axis=0) for _, own in pieces))
+        log_scale, products = np.zeros(len(shapes)), np.zeros((len(shapes), k + 1, k + 1))
+        for piece, own in pieces:
+            columns = np.vstack([piece.values, (own * size).T])
+            for portion in _portions(len(shapes), columns.size):
+                batch = np.broadcast_to(columns, (portion.size, *columns.shape))
+                inner, scales = WhiteAR1().products(batch, shapes[portion], piece.gaps)
+                products[portion] += inner
+                log_scale[portion] += scales
+        inner, onto = products[:, 1:, 1:], products[:, 1:, 0]
+        known = inner + precision * np.outer(size, size)
+        taken = np.einsum("bk,bk->b", onto, np.linalg.solve(known, onto[..., None])[..., 0])
+        squares = products[:, 0, 0] - taken
+        log_density = log_prior - log_scale - 0.5 * np.linalg.slogdet(known)[1]
+        fitted = np.trace(np.linalg.solve(known, inner), axis1=1, axis2=2)
+        count = sum(piece.values.size for piece, _ in pieces) - float(fitted.max())
+        return cls._weighed(shapes, log_density, squares, max(1.0, count))
+
+    @classmethod
+    def _weighed(cls, shapes: Matrix, log_density: Vector, squares: Vector, count: float) -> PlausibleNoise:
+        """With the scale integrated out."""
+        weight = log_density - 0.5 * count * np.log(squares)
         weight = np.exp(weight - weight.max())
         return cls(shapes, weight / weight.sum(), squares, count)
 
@@ -233,9 +270,14 @@ class PlausibleNoise:
 
     def draw(self, size: int, rng: np.random.Generator) -> Matrix:
         """Parameters, (size, 3)."""
+        drawn = self.draw_shapes(size, rng)
+        drawn[:, :2] *= np.sqrt(self.count / rng.chisquare(self.count, size))[:, None]
+        return drawn
+
+    def draw_shapes(self, size: int, rng: np.random.Generator) -> Matrix:
+        """Parameters, the scale at its estimate beside each share and correlation, (size, 3)."""
         chosen = rng.choice(len(self.weights), size, p=self.weights)
-        scale = np.sqrt(self.squares[chosen] / rng.chisquare(self.count, size))
-        return self._scaled(self.shapes[chosen], scale)
+        return self._scaled(self.shapes[chosen], np.sqrt(self.squares[chosen] / self.count))
 
     @staticmethod
     def _scaled(shapes: Matrix, scale: Vector) -> Matrix:
@@ -265,6 +307,12 @@ def quiet_noise(pieces: Sequence[Observed], correlations: tuple[float, float]) -
     sigma, sigma_ar = drawn[:, 0], drawn[:, 1]
     limit = float(np.quantile(sigma_ar, _UPPER))
     return QuietNoise(count, float(np.median(sigma)), float(np.log(sigma).std()), limit)
+
+
+def _portions(shapes: int, samples: int) -> list[Index]:
+    """Parameter sets whose whitened samples fit into memory at once."""
+    count = max(1, shapes * samples // _CELLS)
+    return [portion for portion in np.array_split(np.arange(shapes), count) if portion.size]
 
 
 def _about_own_level(piece: Observed, parameters: Matrix) -> tuple[Vector, Vector]:

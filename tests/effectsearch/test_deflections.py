@@ -10,7 +10,7 @@ from small import ONE, TRUTH, TWO, problem, record, row_values
 
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import in_proportion
 from lcopa_bayes.effectsearch.scores import State

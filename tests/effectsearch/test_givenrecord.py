@@ -10,7 +10,7 @@ from small import TRUTH, problem, record, row_values
 
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.heldoutscores import given_their_records
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import Score, State
 from lcopa_bayes.effectsearch.whitening import Whitening

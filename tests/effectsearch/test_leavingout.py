@@ -12,7 +12,7 @@ from small import TRUTH, record, study
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.leavingout import groups, left_out_scores
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.whitening import Whitening

@@ -18,7 +18,8 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.heldouteffects import Errors
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noise import FEWEST, Law, joint_noise
+from lcopa_bayes.effectsearch.noise import FEWEST, joint_noise
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.openeffects import odds
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
 from lcopa_bayes.effectsearch.signature import Scale

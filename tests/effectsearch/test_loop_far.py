@@ -23,7 +23,8 @@ from lcopa_bayes.effectsearch.candidates import by_turns
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.leavingout import PARTS, groups
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noise import Law, joint_noise
+from lcopa_bayes.effectsearch.noise import joint_noise
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.effectsearch.noise import Law, laws, plausible, scatter_evidence
+from lcopa_bayes.effectsearch.noise import scatter_evidence
+from lcopa_bayes.effectsearch.noiselaw import Law, laws, plausible
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, log_bayes_factors, survival
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1

@@ -14,7 +14,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.openeffects import Alternative, _step, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results

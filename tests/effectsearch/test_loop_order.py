@@ -13,7 +13,7 @@ from small import U, Y, path, problem, record
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import moved
 from lcopa_bayes.effectsearch.whitening import Whitening

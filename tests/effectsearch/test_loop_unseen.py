@@ -17,7 +17,7 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.findings import Side, astray
-from lcopa_bayes.effectsearch.heldouteffects import _independent, _tail, missed
+from lcopa_bayes.effectsearch.heldouteffects import _tail, missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.scores import State, risen
 from lcopa_bayes.effectsearch.verdict import CHANCE, RISEN
@@ -70,15 +70,13 @@ def p_values(kind: str, seeds: range) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "most"), [("white", CHANCE), ("coloured", 0.05), ("heavy", CHANCE)])
-def test_clean_campaigns_are_missed_as_seldom_as_stated(kind, most):
-    """150 campaigns simulated apart from what gives the p-values.
-
-    Where noise of correlation 0.9 is known from the residual of one record alone its memory is
-    underestimated: 4 % where 2 % are stated.
-    """
-    beyond = np.count_nonzero(p_values(kind, range(150)) < CHANCE)
-    assert binom.sf(beyond - 1, 150, most) > 0.01
+@pytest.mark.parametrize("kind", ["white", "coloured", "heavy"])
+def test_clean_campaigns_are_missed_as_seldom_as_stated(kind):
+    """150 campaigns simulated apart from what gives the p-values; means of two p-values may be e times as
+    often below a level, and are not so rarely that they say nothing."""
+    p = p_values(kind, range(150))
+    assert binom.sf(np.count_nonzero(p < CHANCE) - 1, 150, CHANCE) > 0.01
+    assert 0.05 * 150 < np.count_nonzero(p < 0.2) < 0.35 * 150
 
 
 @pytest.mark.parametrize("kind", [pytest.param("white", marks=pytest.mark.slow), "coloured", "heavy"])
@@ -115,18 +113,6 @@ def test_beyond_all_draws_probabilities_are_those_of_the_law(law, least, most):
     sets = (law.rvs(1600, random_state=seed) for seed in range(40))
     found = np.median([_tail(one, reached) for one in sets if one.max() < reached])
     assert least < found / 1e-5 < most
-
-
-@pytest.mark.parametrize(("law", "times"), [(stats.norm, 1.0), (stats.laplace, 2.5), (stats.uniform, 1.0)])
-def test_heavy_noise_knows_its_variance_less_well(law, times):
-    """The variance of sample variances of 50 samples, over that of normal ones, by simulation; lighter noise
-    than normal is taken for normal."""
-    noise = law.rvs(size=(4000, 50), random_state=2)
-    noise = (noise - noise.mean()) / noise.std()
-    known = _independent(noise.ravel(), 50.0)
-    assert known == pytest.approx(50.0 / times, rel=0.1)
-    simulated = 2.0 / np.var((noise**2).mean(axis=1))
-    assert known == pytest.approx(min(50.0, simulated), rel=0.15)
 
 
 def test_of_equal_draws_no_tail_is_known():

@@ -13,7 +13,7 @@ from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
 from lcopa_bayes.effectsearch.scores import State

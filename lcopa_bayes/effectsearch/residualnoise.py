@@ -1,0 +1,108 @@
+"""Noise as the residual of a fit knows it: with what the fit took up of it, with its memory and its tails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
+from lcopa_bayes.effectsearch.noise import joint_noise
+from lcopa_bayes.effectsearch.noiselaw import Law, plausible_in_residual
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.whitening import parts
+from lcopa_bayes.inference.noise import Student
+from lcopa_bayes.inference.observations import Observed
+from lcopa_bayes.inference.recursions import correlated
+
+_FREEDOM = np.array([2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0, 1e6])
+"""Degrees of freedom of Student's law that are tried, the last those of a normal one [-]."""
+_STEPS = 100
+"""Steps to the likeliest scale of each [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ResidualNoise:
+    """Draws of all that the residual on one response axis leaves plausible of its noise."""
+
+    sd: Vector
+    """Scale, the standard deviation where the tails are normal, (draws,) [response unit]."""
+    rho: Vector
+    """Correlation one sampling period apart that gives as many independent samples, (draws,) [-]."""
+    freedom: Vector
+    """Degrees of freedom of what the past does not predict, (draws,) [-]."""
+    widening: Vector
+    """Standard deviations of what a fit leaves open under it, over those under the noise by which the fit
+    weighs its samples, (draws,) [-]."""
+    period: float
+    """Sampling period [time unit]."""
+
+    @classmethod
+    def of(cls, state: State, axis: int, count: int, rng: np.random.Generator) -> Self:
+        """So many draws given the fitted records."""
+        plant, optimum = state.model.plant, state.optimum
+        own, pieces = parts(plant.samples, axis), axis_pieces(plant, optimum.residual, axis)
+        rows = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in own])
+        jacobian, tangents = optimum.jacobian[rows], optimum.tangents[rows]
+        besides = optimum.information - jacobian.T @ jacobian
+        scales = fitted_scales(plant)
+        alone = joint_noise(pieces, plant.table.layout.responses[axis], "", scales)
+        pairs = [(piece, optimum.tangents[part.rows]) for piece, part in zip(pieces, own, strict=True)]
+        precision = besides * state.whitening.weighed[axis].sd ** 2
+        known = plausible_in_residual(pairs, precision, scales, alone.posterior, alone.dependence)
+        laws = known.draw_shapes(count, rng)
+        freedom, scale = _tails(_innovations(Law.of(known), pieces), known.count, count, rng)
+        laws[:, :2] *= scale[:, None]
+        share = laws[:, 1] ** 2 / (laws[:, 0] ** 2 + laws[:, 1] ** 2)
+        rho = laws[:, 2]
+        of_power = 2 * share**2 * rho**2 / (1 - rho**2)  # 1 and this are the samples per independent one
+        variance = laws * np.column_stack([np.sqrt(freedom / (freedom - 2))] * 2 + [np.ones(count)])
+        noise = state.whitening.products_under(variance, state.whitening.adjoint(optimum.jacobian.T), axis)
+        onto = optimum.covariance @ (tangents.T @ tangents) @ optimum.covariance
+        open_to = np.einsum("kl,dlk->d", onto, noise + besides) / np.trace(onto @ optimum.information)
+        return cls(
+            np.hypot(laws[:, 0], laws[:, 1]),
+            np.sqrt(of_power / (of_power + 2)),
+            freedom,
+            np.sqrt(open_to),
+            scales.period,
+        )
+
+    def draw(self, times: Vector, rng: np.random.Generator) -> Matrix:
+        """Noise of each draw at times [time unit], (draws, n) [response unit]."""
+        link = self.rho[:, None] ** (np.diff(times) / self.period)
+        out = rng.standard_t(self.freedom[:, None], (self.sd.size, times.size))
+        out[:, 1:] *= np.sqrt(1 - link**2)
+        return np.asarray(self.sd[:, None] * correlated(out, link))
+
+
+def _innovations(law: Law, pieces: Sequence[Observed]) -> Vector:
+    """What the past does not predict of pieces, over its root mean square [-]."""
+    white = np.concatenate([law.whiten(piece.values, piece.gaps) for piece in pieces])
+    return np.asarray(white / np.sqrt(np.mean(white**2)))
+
+
+def _tails(white: Vector, independent: float, count: int, rng: np.random.Generator) -> tuple[Vector, Vector]:
+    """Draws of degrees of freedom and scale of Student's law given innovations of mean square 1 that know
+    their scale as so many independent ones do, (count,) each [-].
+
+    Degrees of freedom are equally probable before; their evidence is by Laplace's approximation over the
+    logarithm of the scale, of which a sample holds ``2 nu / (nu + 3)`` (Lange, Little and Taylor 1989, J. Am.
+    Stat. Assoc. 84).
+    """
+    squares, nu = white**2, _FREEDOM[:, None]
+    variance = np.ones_like(nu)
+    for _ in range(_STEPS):
+        variance = ((nu + 1) * squares / (nu + squares / variance)).mean(axis=1, keepdims=True)
+    parameters = np.hstack([np.sqrt(variance), nu])
+    density = Student().pointwise(white[None], parameters, np.ones_like(white)).mean(axis=1)
+    information = 2 * independent * _FREEDOM / (_FREEDOM + 3)
+    log_evidence = independent * density - 0.5 * np.log(information)
+    weights = np.exp(log_evidence - log_evidence.max())
+    chosen = rng.choice(_FREEDOM.size, count, p=weights / weights.sum())
+    spread = rng.standard_normal(count) / np.sqrt(information[chosen])
+    return _FREEDOM[chosen], parameters[chosen, 0] * np.exp(spread)

@@ -1,0 +1,142 @@
+"""Noise as the residual of a fit knows it."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from test_loop_noise import scales
+from test_loop_unseen import SD, campaign, fitted
+
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
+from lcopa_bayes.effectsearch.noise import joint_noise
+from lcopa_bayes.effectsearch.noiselaw import plausible, plausible_in_residual
+from lcopa_bayes.effectsearch.residualnoise import ResidualNoise, _tails
+from lcopa_bayes.inference.noise import AR1
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise
+
+SHAPES = np.array([[1.0, 0.0, 0.5], [0.6, 0.8, 0.7], [0.0, 1.0, 0.9], [0.0, 1.0, 0.98]])
+
+
+def piece(values: np.ndarray, gaps: np.ndarray | None = None) -> Observed:
+    return Observed(np.arange(values.size), values, np.ones(values.size) if gaps is None else gaps)
+
+
+def test_a_level_of_each_piece_is_one_regressor_each(rng):
+    """Levels by closed form, and as coefficients of which nothing is known besides."""
+    pieces = [piece(rng.standard_normal(n), 0.5 + rng.random(n)) for n in (30, 50)]
+    levels = np.repeat(np.eye(2), (30, 50), axis=0)
+    pairs = [(pieces[0], levels[:30]), (pieces[1], levels[30:])]
+    prior = np.log(np.arange(1.0, 5.0))
+    by_level = PlausibleNoise.of(pieces, SHAPES, prior)
+    by_fit = PlausibleNoise.of_residual(pairs, np.zeros((2, 2)), SHAPES, prior)
+    assert by_fit.count == pytest.approx(by_level.count)
+    np.testing.assert_allclose(by_fit.squares, by_level.squares, rtol=1e-10)
+    np.testing.assert_allclose(by_fit.weights, by_level.weights, rtol=1e-8)
+
+
+def test_coefficients_are_integrated_out_by_dense_algebra(rng):
+    """Density of the samples under the covariance of noise and coefficients, at any shape."""
+    n, columns = 40, rng.standard_normal((40, 3)).cumsum(axis=0)
+    root = rng.standard_normal((3, 3))
+    precision, values = root @ root.T, rng.standard_normal(n)
+    found = PlausibleNoise.of_residual([(piece(values), columns)], precision, SHAPES, np.zeros(4))
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    expected = []
+    for (white, correlated, rho), squares in zip(SHAPES, found.squares, strict=True):
+        dense = white**2 * np.eye(n) + correlated**2 * rho**apart
+        dense += columns @ np.linalg.solve(precision, columns.T)
+        assert squares == pytest.approx(values @ np.linalg.solve(dense, values))
+        expected.append(-0.5 * np.linalg.slogdet(dense)[1] - 0.5 * found.count * np.log(squares))
+    np.testing.assert_allclose(np.diff(np.log(found.weights)), np.diff(expected), rtol=1e-9)
+    assert n - 3 < found.count < n
+
+
+def test_what_a_fit_takes_up_of_slow_noise_is_known():
+    """Noise of correlation 0.9 and sd 1 beside a fitted line and a slow wave: by its residual alone it is
+    smaller and shorter than it is, which a fit that knows its regressors undoes."""
+    n, given = 300, scales(300)
+    time = np.linspace(-1, 1, n)
+    columns = np.column_stack([np.ones(n), time, np.sin(3 * time), np.cos(3 * time)])
+    rng, none = np.random.default_rng(4), 1e-9 * np.eye(4)
+    drawn = AR1().draw(np.tile([1.0, 0.9], (80, 1)), np.ones(n), rng)
+    alone, beside = [], []
+    for noise in drawn:
+        left = [piece(noise - columns @ np.linalg.lstsq(columns, noise)[0])]
+        known = joint_noise(left, Axis("x", "V"), "", given)
+        alone.append(plausible(left, given).draw(400, rng)[:, :2])
+        pairs = [(left[0], columns)]
+        restricted = plausible_in_residual(pairs, none, given, known.posterior, known.dependence)
+        beside.append(restricted.draw(400, rng)[:, :2])
+    ranks = [np.mean(np.hypot(*np.moveaxis(np.array(each), -1, 0)) < 1.0, axis=1) for each in (alone, beside)]
+    assert np.mean(ranks[0]) > 0.65
+    assert stats.kstest(ranks[1], "uniform").pvalue > 0.01
+    assert stats.kstest(ranks[0], "uniform").pvalue < 1e-3
+
+
+@pytest.mark.parametrize("freedom", [3.0, 1e6])
+def test_tails_and_scale_are_those_of_the_innovations(freedom):
+    """The quartile drawn is as often below the true one as of a uniform rank, and degrees of freedom are near
+    the true ones."""
+    rng, ranks, nearest = np.random.default_rng(3), [], []
+    quartile = stats.t.ppf(0.75, freedom)
+    for _ in range(100):
+        noise = rng.standard_t(freedom, 300)
+        size = np.sqrt(np.mean(noise**2))
+        found, scale = _tails(noise / size, 300.0, 400, rng)
+        ranks.append(np.mean(scale * size * stats.t.ppf(0.75, found) < quartile))
+        nearest.append(np.median(found))
+    assert abs(np.mean(ranks) - 0.5) < 0.12  # four standard errors
+    assert np.mean(np.abs(np.array(ranks) - 0.5) < 0.45) > 0.8
+    assert np.median(nearest) == 3.0 if freedom == 3.0 else np.median(nearest) >= 20.0
+
+
+def test_rare_large_innovations_do_not_decide_the_scale():
+    """One sample of 40 standard deviations leaves the rest as large as they are."""
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal(300)
+    noise[7] = 40.0
+    size = np.sqrt(np.mean(noise**2))
+    freedom, scale = _tails(noise / size, 300.0, 400, rng)
+    assert size > 2.3
+    assert 0.6 < np.median(scale * size) < 1.0
+    assert freedom.max() < 1e6
+
+
+@pytest.mark.parametrize("kind", ["white", "coloured"])
+def test_what_a_fit_leaves_open_is_that_of_dense_algebra(kind):
+    """Estimates weigh their samples alike; their covariance under a law is the sandwich of White (1982)."""
+    study = campaign(kind, 1)
+    _, state = fitted(study)
+    found = ResidualNoise.of(state, 0, 5, np.random.default_rng(1))
+    tangents, optimum = state.optimum.tangents, state.optimum
+    n, sd = len(tangents), state.whitening.weighed[0].sd
+    pieces, given = axis_pieces(state.model.plant, optimum.residual, 0), fitted_scales(state.model.plant)
+    known = joint_noise(pieces, study.response_axes[0], "", given)
+    besides = optimum.information - tangents.T @ tangents / sd**2
+    rng = np.random.default_rng(1)
+    pairs = [(pieces[0], tangents)]
+    noise = plausible_in_residual(pairs, besides * sd**2, given, known.posterior, known.dependence)
+    laws = noise.draw_shapes(5, rng)
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    gain = np.linalg.solve(optimum.information, tangents.T / sd**2)
+    prior = np.linalg.solve(optimum.information, np.linalg.solve(optimum.information, besides).T)
+    wide = np.trace(tangents @ np.linalg.solve(optimum.information, tangents.T))
+    for law, size, freedom, widening in zip(laws, found.sd, found.freedom, found.widening, strict=True):
+        larger = size**2 / (law[0] ** 2 + law[1] ** 2) * freedom / (freedom - 2)
+        noise = larger * (law[0] ** 2 * np.eye(n) + law[1] ** 2 * law[2] ** apart)
+        spread = gain @ noise @ gain.T + prior
+        assert widening**2 == pytest.approx(np.trace(tangents @ spread @ tangents.T) / wide, rel=1e-6)
+
+
+def test_draws_have_the_scale_the_memory_and_the_tails_of_each():
+    """4000 records of equally and unequally spaced samples."""
+    rng = np.random.default_rng(2)
+    many = np.ones(4000)
+    noise = ResidualNoise(SD * many, 0.8 * many, 1e6 * many, many, 0.5)
+    drawn = noise.draw(np.array([0.0, 0.5, 2.0]), rng)
+    np.testing.assert_allclose(drawn.std(axis=0), SD, rtol=0.05)
+    correlation = np.corrcoef(drawn.T)
+    assert correlation[0, 1] == pytest.approx(0.8, abs=0.03)
+    assert correlation[0, 2] == pytest.approx(0.8**4, abs=0.05)
+    heavy = ResidualNoise(SD * many, 0.0 * many, 3.0 * many, many, 0.5).draw(np.arange(3.0), rng)
+    assert stats.kstest(heavy.ravel() / SD, "t", args=(3,)).pvalue > 0.01
