@@ -50,6 +50,9 @@ _CONTRADICTION, _SLIGHT = 20.0, 0.05
 _EXCHANGED = 5.0
 """What a prediction misses of a record as it is, over what it misses with exchanged axes, from which they
 are exchanged [-]."""
+_BEYOND = 5.0
+"""What a prediction misses over the variance that is left open of it, from which it misses more than that
+[-]: the square of one normal error is above it in 3 % of cases."""
 _SURE = 5.0
 """Standard errors from zero from which a ratio has a sign and a size [-]."""
 _DISAGREE = "records disagree: "
@@ -213,6 +216,8 @@ class _Ratio:
     """Variance of the response over the square of the other record's range [-]."""
     missed: float
     """The same of response less unscaled prediction [-]."""
+    unknown: float
+    """The same of what the other record leaves open of that prediction [-]."""
 
     @property
     def remedy(self) -> str:
@@ -300,7 +305,9 @@ class _Comparison:
             ratio = float(scaled.coefficients[0])
             variance = float(scaled.covariance[0, 0] + ratio**2 * lever @ known.covariance @ lever)
             size, missed = (float(np.nanvar(each) / known.span**2) for each in (seen, seen - predicted))
-            out.append(_Ratio(k, ratio, float(np.sqrt(variance)), scaled.misfit, size, missed))
+            moves = np.cov(target[np.isfinite(seen)].T, bias=True)
+            unknown = float(np.sum(moves * known.covariance)) / known.span**2
+            out.append(_Ratio(k, ratio, float(np.sqrt(variance)), scaled.misfit, size, missed, unknown))
         return out
 
     def _exchanges(self) -> Iterator[_Order]:
@@ -313,13 +320,14 @@ class _Comparison:
 
     @property
     def _as_is(self) -> float:
-        """Least share that is missed of the record as it is [-]; NaN where a drive moves in it alone.
+        """Least share that is missed of the record as it is, 0 where what the others leave open explains it
+        [-]; NaN where a drive moves in it alone.
 
         A record that moves one drive says nothing of one that moves another, which may respond much alike,
         and one that moves both at once tells them apart badly: all others together know it better.
         """
-        known = (one for one in (self, self.together) if one is not None and one.ratios)
-        return min((_missed(one.ratios) for one in known), default=np.nan)
+        known = (one.ratios for one in (self, self.together) if one is not None and one.ratios)
+        return min((_missed(one) if _is_known(one) else 0.0 for one in known), default=np.nan)
 
     def disagreement(self) -> Disagreement | None:
         """The most severe one; None where the record agrees or cannot be judged."""
@@ -353,6 +361,11 @@ def _centred(columns: Matrix, response: Vector) -> tuple[Matrix, Vector]:
 def _missed(ratios: Sequence[_Ratio]) -> float:
     """Share of the variance of all responses that unscaled predictions miss [-]; 1 of no responses."""
     return sum(one.missed for one in ratios) / sum(one.size for one in ratios) if ratios else 1.0
+
+
+def _is_known(ratios: Sequence[_Ratio]) -> bool:
+    """Whether predictions miss more than what is left open of them explains."""
+    return sum(one.missed for one in ratios) > _BEYOND * sum(one.unknown for one in ratios)
 
 
 def _with_exchanged(count: int, i: int, j: int) -> tuple[int, ...]:

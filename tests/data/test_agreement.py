@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from shapes import SHAPES
 from small import ONE, TWO, path, record, study
 
-from lcopa_bayes.bench.command import joint, on_off, prbs, staircase, step
+from lcopa_bayes.bench.command import Command, joint, on_off, prbs, staircase, step
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
@@ -75,7 +75,7 @@ def test_a_reversed_connection_is_recognised() -> None:
 )
 def test_a_reversed_sign_has_about_the_size_that_is_predicted(ratio: float, reversed_sign: bool) -> None:
     """A twelfth of it with the other sign is a prediction from drives that do not show the plant."""
-    seen = _Ratio(0, ratio, 0.01, misfit=0.2, size=1.0, missed=1.0)
+    seen = _Ratio(0, ratio, 0.01, misfit=0.2, size=1.0, missed=1.0, unknown=0.0)
     assert (seen.remedy == _SIGN) is reversed_sign
     assert bool(seen.remedy) is reversed_sign
 
@@ -173,6 +173,41 @@ def test_drives_that_move_one_after_the_other_and_act_alike_are_not_exchanged() 
     wrong = replace(records[1], drive=records[1].drive[:, ::-1])
     (said,) = disagreements([records[0], wrong, *records[2:]])
     assert said.records[0] == "r1"
+    assert "drives 'x' and 'y' exchanged" in said.reason
+
+
+def three_drives(changes: int, seed: int) -> list[Record]:
+    """Four records of one response in which each of three drives moves so often, at any time."""
+    rng = np.random.default_rng(seed)
+    device = replace(
+        ONE,
+        paths=(
+            tuple(path(gain, 0.7, (tau,), (0.9,)) for gain, tau in ((0.3, 1.0), (1.1, 1.3), (-0.5, 1.6))),
+        ),
+        drive_axes=tuple(replace(ONE.drive_axes[0], name=name) for name in "xyz"),
+    )
+
+    def moved() -> Command:
+        """One drive."""
+        times = np.sort(rng.uniform(2.0, 19.5, changes))
+        return Command(times, rng.choice([-1.0, 0.0, 1.0], (changes, 1)), np.zeros(1))
+
+    commands = [joint(moved(), moved(), moved()) for _ in range(4)]
+    return [
+        record(10 * seed + k, device=device, command=command, duration=20.0, name=f"r{k}")
+        for k, command in enumerate(commands)
+    ]
+
+
+def test_predictions_of_which_little_is_known_show_no_exchange() -> None:
+    """A drive that moves once, just before the end of the other records, is hardly known from them."""
+    for seed in range(8):
+        assert disagreements(three_drives(1, seed)) == ()
+    records = three_drives(6, 1)
+    assert disagreements(records) == ()
+    records[2] = replace(records[2], drive=records[2].drive[:, [1, 0, 2]])
+    (said,) = disagreements(records)
+    assert said.records[0] == "r2"
     assert "drives 'x' and 'y' exchanged" in said.reason
 
 
