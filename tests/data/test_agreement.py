@@ -200,8 +200,8 @@ def three_drives(changes: int, seed: int) -> list[Record]:
 
 
 def test_predictions_of_which_little_is_known_show_no_exchange() -> None:
-    """A drive that moves once, just before the end of the other records, is hardly known from them: of 56 such
-    campaigns these five were taken for exchanged by what is missed alone."""
+    """A drive that moves once, just before the end of the other records, is hardly known from them: of 56
+    such campaigns these five were taken for exchanged by what is missed alone."""
     for seed in (15, 16, 24, 30, 51):
         assert disagreements(three_drives(1, seed)) == ()
     records = three_drives(6, 1)
