@@ -8,10 +8,11 @@ from typing import Self, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
 from lcopa_bayes.effectsearch.noise import joint_noise
 from lcopa_bayes.effectsearch.noiselaw import Law, plausible_in_residual
+from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.whitening import parts
 from lcopa_bayes.inference.noise import Student
@@ -46,29 +47,31 @@ class ResidualNoise:
         """So many draws given the fitted records."""
         plant, optimum = state.model.plant, state.optimum
         own, pieces = parts(plant.samples, axis), axis_pieces(plant, optimum.residual, axis)
-        rows = np.concatenate([np.arange(part.rows.start, part.rows.stop) for part in own])
-        jacobian, tangents = optimum.jacobian[rows], optimum.tangents[rows]
-        besides = optimum.information - jacobian.T @ jacobian
+        regressors = [optimum.tangents[part.rows] for part in own]
+        jacobian = np.concatenate([optimum.jacobian[part.rows] for part in own])
+        besides = optimum.information - jacobian.T @ jacobian  # what other axes and priors say
         scales = fitted_scales(plant)
         alone = joint_noise(pieces, plant.table.layout.responses[axis], "", scales)
-        pairs = [(piece, optimum.tangents[part.rows]) for piece, part in zip(pieces, own, strict=True)]
-        precision = besides * state.whitening.weighed[axis].sd ** 2
-        known = plausible_in_residual(pairs, precision, scales, alone.posterior, alone.dependence)
+        known = plausible_in_residual(
+            list(zip(pieces, regressors, strict=True)),
+            besides * state.whitening.weighed[axis].sd ** 2,
+            scales,
+            alone.posterior,
+            alone.dependence,
+        )
         laws = known.draw_shapes(count, rng)
         freedom, scale = _tails(_innovations(Law.of(known), pieces), known.count, count, rng)
         laws[:, :2] *= scale[:, None]
-        share = laws[:, 1] ** 2 / (laws[:, 0] ** 2 + laws[:, 1] ** 2)
-        rho = laws[:, 2]
-        of_power = 2 * share**2 * rho**2 / (1 - rho**2)  # 1 and this are the samples per independent one
-        variance = laws * np.column_stack([np.sqrt(freedom / (freedom - 2))] * 2 + [np.ones(count)])
-        noise = state.whitening.products_under(variance, state.whitening.adjoint(optimum.jacobian.T), axis)
-        onto = optimum.covariance @ (tangents.T @ tangents) @ optimum.covariance
-        open_to = np.einsum("kl,dlk->d", onto, noise + besides) / np.trace(onto @ optimum.information)
+        white, correlated_sd, rho = laws.T
+        of_power = 2 * rho**2 / (1 - rho**2) * (correlated_sd**2 / (white**2 + correlated_sd**2)) ** 2
+        heavier = np.sqrt(freedom / (freedom - 2))
+        of_all = np.column_stack([heavier * white, heavier * correlated_sd, rho])
+        noise = state.whitening.products_under(of_all, state.whitening.adjoint(optimum.jacobian.T), axis)
         return cls(
-            np.hypot(laws[:, 0], laws[:, 1]),
-            np.sqrt(of_power / (of_power + 2)),
+            np.hypot(white, correlated_sd),
+            np.sqrt(of_power / (of_power + 2)),  # samples per independent one are 1 and this
             freedom,
-            np.sqrt(open_to),
+            _widening(optimum, np.concatenate(regressors), noise + besides),
             scales.period,
         )
 
@@ -78,6 +81,17 @@ class ResidualNoise:
         out = rng.standard_t(self.freedom[:, None], (self.sd.size, times.size))
         out[:, 1:] *= np.sqrt(1 - link**2)
         return np.asarray(self.sd[:, None] * correlated(out, link))
+
+
+def _widening(optimum: Optimum, tangents: Matrix, slopes: Array) -> Vector:
+    """Root mean square standard deviation of a fitted response with these `tangents` (n, k), over that where
+    the weights are right, (draws,) [-]; `slopes`, covariances of the slope of the cost, (draws, k, k).
+
+    By the sandwich of White (1982, Econometrica 50).
+    """
+    onto = optimum.covariance @ (tangents.T @ tangents) @ optimum.covariance
+    variance = np.einsum("kl,dlk->d", onto, slopes) / np.trace(onto @ optimum.information)
+    return np.asarray(np.sqrt(variance))
 
 
 def _innovations(law: Law, pieces: Sequence[Observed]) -> Vector:
