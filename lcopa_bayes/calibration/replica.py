@@ -210,7 +210,7 @@ class Replication:
         """Times after a unit step at which every path has begun to answer [time unit]."""
         table, span = self.problem.posterior.table, self.problem.scales.span
         delays = [table.rows[k] for k in table.of_kind("delay")]
-        latest = max(row.value if row.prior is None else row.prior.frozen.ppf(_LATEST) for row in delays)
+        latest = max(row.value if row.prior is None else float(row.quantiles([_LATEST])[0]) for row in delays)
         begin = min(float(latest), span / 2)
         return np.array([begin + share * (span - begin) for share in _SHARES])
 

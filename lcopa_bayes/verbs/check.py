@@ -5,7 +5,6 @@ What a study holds, before anything is fitted: axes, drives, sampling, noise at 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -228,22 +227,22 @@ def _counted(number: int, noun: str) -> str:
 def _prior(row: Parameter) -> dict[str, Any]:
     if row.prior is None:
         return {"name": row.name, "unit": row.unit, "value": row.value, "words": f"fixed at {row.value:.6g}"}
-    ends: Sequence[float] = [float(row.prior.frozen.ppf(end)) for end in _ENDS]
+    low, high = row.quantiles(_ENDS).tolist()
     return {
         "name": row.name,
         "unit": row.unit,
-        "lower": ends[0],
-        "upper": ends[1],
+        "lower": low,
+        "upper": high,
         "prior": str(row.prior),
         "from": "default" if row.default else "study",
-        "words": _words(row.prior, ends),
+        "words": _words(row.prior, (low, high), row.domain),
     }
 
 
-def _words(prior: Prior, ends: Sequence[float]) -> str:
+def _words(prior: Prior, ends: tuple[float, float], domain: tuple[float, float]) -> str:
     """What a prior says, in words: a density that is level has hard ends, and no other places to name."""
     if prior.dist in _LEVEL:
-        low, high = prior.support
+        low, high = domain
         return f"anywhere between {low:.4g} and {high:.4g}{_LEVEL[prior.dist]}"
     return f"between {ends[0]:.3g} and {ends[1]:.3g} with 90 % probability"
 

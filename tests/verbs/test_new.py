@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import halfnorm
 from small import ON_OFF_TABLE as TABLE
 from small import record
 
@@ -213,6 +214,19 @@ def test_a_level_prior_is_said_by_its_ends():
     assert float(said["delay"]["words"].split()[-1]) == pytest.approx(said["delay"]["upper"] / 0.95, rel=1e-3)
     assert said["time_1"]["words"].endswith(", every decade alike")
     assert said["gain"]["words"].endswith(" with 90 % probability")
+
+
+def test_a_prior_that_reaches_beyond_its_parameter_is_said_within():
+    """A normal prior of a delay about 0 is half a normal one, and a level one ends where orders do."""
+    priors = {
+        "delay": {"dist": "norm", "loc": 0.0, "scale": 1.0},
+        "order_1": {"dist": "uniform", "loc": -1.0, "scale": 4.0},
+    }
+    result = lb.check(lb.Study("small", fit=[record(1, name="on")], terms=1, priors=priors))
+    said = {one["name"]: one for one in result.to_json()["parameters"]}
+    assert said["delay"]["lower"] == pytest.approx(halfnorm.ppf(0.05))
+    assert said["delay"]["upper"] == pytest.approx(halfnorm.ppf(0.95))
+    assert said["order_1"]["words"].startswith("anywhere between 0 and 2")
 
 
 def test_sentences_of_a_printed_table_begin_in_one_column():
