@@ -157,7 +157,7 @@ def _driven(record: Record) -> list[dict[str, Any]]:
 def _response(record: Record, samples: Samples, axis: int, began: float) -> dict[str, Any]:
     observed, at_rest = samples.axes[axis], samples.quiet(axis)
     times = samples.times[observed.index]
-    scatter = float(at_rest.values.std(ddof=1)) if at_rest.values.size > 1 else None
+    scatter = _scatter(at_rest.values) if at_rest.values.size > 1 else None
     name = record.response_axes[axis]
     return {
         "axis": name.name,
@@ -172,11 +172,16 @@ def _response(record: Record, samples: Samples, axis: int, began: float) -> dict
     }
 
 
+def _scatter(values: Vector) -> float:
+    """Standard deviation; of equal values exactly 0, which their mean may round away from."""
+    return float(values.std(ddof=1)) if np.ptp(values) > 0.0 else 0.0
+
+
 def _onset(times: Vector, values: Vector, at_rest: Vector, began: float) -> float | None:
     """Time from the first change of a drive to the first clear deviation from rest; None without one."""
     if at_rest.size < _STILL or at_rest.size + _IN_TURN > values.size:
         return None
-    away = np.abs(values - at_rest.mean()) > _AWAY * at_rest.std(ddof=1)
+    away = np.abs(values - at_rest.mean()) > _AWAY * _scatter(at_rest)
     away[: at_rest.size] = False
     in_turn = np.convolve(away, np.ones(_IN_TURN, dtype=int), mode="valid") == _IN_TURN
     return float(times[int(in_turn.argmax())] - began) if in_turn.any() else None
@@ -212,8 +217,8 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
         )
         said += f", {axis['missing']} missing" if axis["missing"] else ""
         if axis["scatter"] is not None:
-            scatter = measured(axis["scatter"], axis["unit"], ".2g")
-            said += f"; {axis['at_rest']} at rest, which scatter by {scatter}"
+            scatter = f"scatter by {measured(axis['scatter'], axis['unit'], '.2g')}"
+            said += f"; {axis['at_rest']} at rest, which {scatter if axis['scatter'] else 'are all equal'}"
         if axis["onset"] is not None:
             said += f"; it moves clearly {axis['onset']:.3g} {unit} after the first change of a drive"
         out.append(f"{said}.")

@@ -42,6 +42,11 @@ class CommandParser(argparse.ArgumentParser):
     verbs: Mapping[str, CommandParser] = MappingProxyType({})
     """Parsers of the verbs, where this one knows them."""
 
+    @property
+    def options(self) -> list[str]:
+        """Long forms of its options."""
+        return re.findall(r"--[\w-]+", self.format_help().partition("example: ")[0])
+
     def error(self, message: str) -> NoReturn:
         """Print what is wrong with the command line and exit."""
         verb = next((one for one in self.given if not one.startswith("-")), "")
@@ -49,11 +54,13 @@ class CommandParser(argparse.ArgumentParser):
         if verb and self.verbs and verb not in self.verbs:
             message = f"{verb!r} is not a verb{nearest(verb, self.verbs)}"
         elif unknown and verb in self.verbs:
-            options = re.findall(r"--[\w-]+", self.verbs[verb].format_help())
-            message = f"{unknown[1]} is not an option of {verb}{nearest(unknown[1], options)}"
+            options = {name: parser.options for name, parser in self.verbs.items()}
+            elsewhere = any(unknown[1] in own for own in options.values())  # no misspelt word
+            example = str(self.verbs[verb].epilog).partition("\n")[0]
+            meant = f"; {example}" if elsewhere else nearest(unknown[1], options[verb])
+            message = f"{unknown[1]} is not an option of {verb}{meant}"
         elif not verb and self.verbs and self.given:
-            options = re.findall(r"--[\w-]+", self.format_help())
-            message = f"{self.given[0]} is not an option{nearest(self.given[0], options)}"
+            message = f"{self.given[0]} is not an option{nearest(self.given[0], self.options)}"
         elif "--json" not in self.given:
             self.print_usage(sys.stderr)
         raise SystemExit(refused([message], as_json="--json" in self.given))

@@ -39,6 +39,7 @@ def test_the_version_is_that_of_the_package(capsys):
             ("fit", "x", "--folder"),
             "of fit; known: --cross-check, --dask, --held-out, --help, --jobs, --json",
         ),
+        (("new", "x", "--out", "y"), "--out is not an option of new; example: lcopa-bayes new oven "),
         (("audit",), "the following arguments are required: source"),
         (("predict", "a", "b", "--offset", "some"), "invalid choice: 'some'"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -214,6 +215,18 @@ def test_a_level_prior_is_said_by_its_ends():
     assert float(said["delay"]["words"].split()[-1]) == pytest.approx(said["delay"]["upper"] / 0.95, rel=1e-3)
     assert said["time_1"]["words"].endswith(", every decade alike")
     assert said["gain"]["words"].endswith(" with 90 % probability")
+
+
+def test_equal_samples_at_rest_do_not_scatter():
+    """Their mean may round away from them: that of 0.1 three times does."""
+    on = record(1, name="on")
+    response = np.where(on.drive != 0, on.response, 0.1)
+    result = lb.check(lb.Study("small", fit=[replace(on, response=response)], terms=1))
+    (axis,) = result.to_json()["records"][0]["responses"]
+    assert axis["at_rest"] == 3
+    assert np.std([0.1] * 3) > 0.0
+    assert axis["scatter"] == 0.0
+    assert "3 at rest, which are all equal" in str(result)
 
 
 def test_a_prior_that_reaches_beyond_its_parameter_is_said_within():
