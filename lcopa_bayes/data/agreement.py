@@ -327,7 +327,7 @@ class _Comparison:
         and one that moves both at once tells them apart badly: all others together know it better.
         """
         known = (one.ratios for one in (self, self.together) if one is not None and one.ratios)
-        return min((_missed(one) if _is_known(one) else 0.0 for one in known), default=np.nan)
+        return min((_missed(one) if _surely_missed(one) else 0.0 for one in known), default=np.nan)
 
     def disagreement(self) -> Disagreement | None:
         """The most severe one; None where the record agrees or cannot be judged."""
@@ -363,7 +363,7 @@ def _missed(ratios: Sequence[_Ratio]) -> float:
     return sum(one.missed for one in ratios) / sum(one.size for one in ratios) if ratios else 1.0
 
 
-def _is_known(ratios: Sequence[_Ratio]) -> bool:
+def _surely_missed(ratios: Sequence[_Ratio]) -> bool:
     """Whether predictions miss more than what is left open of them explains."""
     return sum(one.missed for one in ratios) > _BEYOND * sum(one.unknown for one in ratios)
 

@@ -95,7 +95,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     of_records: list[str] = []  # or of code: with these nothing more can be checked
     if named:
         apart = [*_inside(folder, named.held_out, where("records"), of_records), *held_out]
-        kept = {file.resolve() for file in apart}
+        kept = {file.resolve() for file in (*(folder / name for name in named.held_out), *held_out)}
         beside = [file for file in tables_in(folder) if file.resolve() not in kept]
         names = named.fit or [file.name for file in beside]
         fit = _inside(folder, names, where("records"), of_records)

@@ -122,12 +122,17 @@ def own_correlation(own: float, likeliest: Law, samples: int) -> float | None:
     """Correlation of noise with a memory of `own` samples per independent one, where the likeliest law of a
     residual of so many samples remembers much longer; else None.
 
-    From sample to sample a smooth misfit looks like a random walk. Its own autocorrelations sum up to less,
-    and ``sum_k rho^2k = (1 + rho^2) / (1 - rho^2)`` is their sum.
+    From sample to sample a smooth misfit looks like a random walk; its own autocorrelations sum up to less.
     """
     if own >= _SHORTER * likeliest.correlated(samples):
         return None
-    return float(np.sqrt((own - 1) / (own + 1)))
+    return float(single_correlation(own - 1))
+
+
+def single_correlation(beyond: Array | float) -> Array:
+    """Correlation of noise without a white part of which 1 and so many samples count as an independent one of
+    a power [-]: ``sum_k rho^2k = (1 + rho^2) / (1 - rho^2)`` over all lags."""
+    return np.asarray(np.sqrt(beyond / (np.asarray(beyond) + 2)))
 
 
 def laws(drawn: Matrix) -> list[Law]:

@@ -11,7 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
 from lcopa_bayes.effectsearch.noise import joint_noise
-from lcopa_bayes.effectsearch.noiselaw import Law, plausible_in_residual
+from lcopa_bayes.effectsearch.noiselaw import Law, plausible_in_residual, single_correlation
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.whitening import parts
@@ -63,13 +63,14 @@ class ResidualNoise:
         freedom, scale = _tails(_innovations(Law.of(known), pieces), known.count, count, rng)
         laws[:, :2] *= scale[:, None]
         white, correlated_sd, rho = laws.T
-        of_power = 2 * rho**2 / (1 - rho**2) * (correlated_sd**2 / (white**2 + correlated_sd**2)) ** 2
+        share = correlated_sd**2 / (white**2 + correlated_sd**2)
+        beyond = 2 * share**2 * rho**2 / (1 - rho**2)  # as `Law.correlated` over all lags, less 1
         heavier = np.sqrt(freedom / (freedom - 2))
         of_all = np.column_stack([heavier * white, heavier * correlated_sd, rho])
         noise = state.whitening.products_under(of_all, state.whitening.adjoint(optimum.jacobian.T), axis)
         return cls(
             np.hypot(white, correlated_sd),
-            np.sqrt(of_power / (of_power + 2)),  # samples per independent one are 1 and this
+            single_correlation(beyond),
             freedom,
             _widening(optimum, np.concatenate(regressors), noise + besides),
             scales.period,

@@ -157,7 +157,7 @@ def _driven(record: Record) -> list[dict[str, Any]]:
 def _response(record: Record, samples: Samples, axis: int, began: float) -> dict[str, Any]:
     observed, at_rest = samples.axes[axis], samples.quiet(axis)
     times = samples.times[observed.index]
-    scatter = _scatter(at_rest.values) if at_rest.values.size > 1 else None
+    scatter = _rest(at_rest.values)[1] if at_rest.values.size > 1 else None
     name = record.response_axes[axis]
     return {
         "axis": name.name,
@@ -172,16 +172,19 @@ def _response(record: Record, samples: Samples, axis: int, began: float) -> dict
     }
 
 
-def _scatter(values: Vector) -> float:
-    """Standard deviation; of equal values exactly 0, which their mean may round away from."""
-    return float(values.std(ddof=1)) if np.ptp(values) > 0.0 else 0.0
+def _rest(values: Vector) -> tuple[float, float]:
+    """Mean and standard deviation; of equal values exactly these and 0, from which both may be rounded."""
+    if np.ptp(values) == 0.0:
+        return float(values[0]), 0.0
+    return float(values.mean()), float(values.std(ddof=1))
 
 
 def _onset(times: Vector, values: Vector, at_rest: Vector, began: float) -> float | None:
     """Time from the first change of a drive to the first clear deviation from rest; None without one."""
     if at_rest.size < _STILL or at_rest.size + _IN_TURN > values.size:
         return None
-    away = np.abs(values - at_rest.mean()) > _AWAY * _scatter(at_rest)
+    level, scatter = _rest(at_rest)
+    away = np.abs(values - level) > _AWAY * scatter
     away[: at_rest.size] = False
     in_turn = np.convolve(away, np.ones(_IN_TURN, dtype=int), mode="valid") == _IN_TURN
     return float(times[int(in_turn.argmax())] - began) if in_turn.any() else None

@@ -15,6 +15,7 @@ from small import ON_OFF_TABLE as TABLE
 from small import record
 
 import lcopa_bayes as lb
+from lcopa_bayes.bench.command import step
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.results.result import _text_table
@@ -218,15 +219,17 @@ def test_a_level_prior_is_said_by_its_ends():
 
 
 def test_equal_samples_at_rest_do_not_scatter():
-    """Their mean may round away from them: that of 0.1 three times does."""
-    on = record(1, name="on")
-    response = np.where(on.drive != 0, on.response, 0.1)
+    """Their mean may round away from them, as that of 0.1 seven times does: nor do they move before anything
+    else does."""
+    on = record(1, name="on", command=step(1.0, at=1.0))
+    response = np.where(on.time[:, None] > 2.0, on.response, 0.1)
     result = lb.check(lb.Study("small", fit=[replace(on, response=response)], terms=1))
     (axis,) = result.to_json()["records"][0]["responses"]
-    assert axis["at_rest"] == 3
-    assert np.std([0.1] * 3) > 0.0
+    assert axis["at_rest"] == 7
+    assert np.std([0.1] * 7) > 0.0
     assert axis["scatter"] == 0.0
-    assert "3 at rest, which are all equal" in str(result)
+    assert axis["onset"] > 1.0
+    assert "7 at rest, which are all equal" in str(result)
 
 
 def test_a_prior_that_reaches_beyond_its_parameter_is_said_within():

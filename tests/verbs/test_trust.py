@@ -157,6 +157,19 @@ def test_all_else_that_is_wrong_is_said_with_the_files_that_are_outside(stranger
     assert not (stranger / "executed").exists()
 
 
+def test_a_held_out_file_outside_is_said_once(tmp_path):
+    """By a link; where no record to fit is named it is none of them."""
+    save_record(record(camera=0.8), tmp_path / "secret.csv")
+    folder = tmp_path / "a"
+    folder.mkdir()
+    save_record(record(camera=0.8), folder / "step.csv")
+    (folder / "link.csv").symlink_to("../secret.csv")
+    (folder / "study.toml").write_text('[records]\nheld_out = ["link.csv"]\n')
+    with pytest.raises(lb.InputError) as refused:
+        lb.load_study(folder)
+    assert len(refused.value.problems) == 1
+
+
 def test_files_inside_the_folder_need_no_trust(tmp_path):
     folder = tmp_path / "real"
     (folder / "data").mkdir(parents=True)
