@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import ceil
 from time import monotonic
 from typing import final
 
@@ -63,6 +64,9 @@ _ROUNDS, _KEPT, _THIN = 24, 20, 5
 _MOVED = 0.15
 """Change of a mean by a round of moves from which walkers do not rest, and by all of them from which the
 weights missed part of a posterior [sd]."""
+_APART = 1.5
+"""Draws of a walker from one taken to the next, over those that are worth one independent draw [-]: of an
+AR(1) process these are worth 0.9 of as many independent ones, and draws at random half as many."""
 
 
 def weighted_run(
@@ -219,11 +223,12 @@ class _Walk:
     """Largest change of a mean from that of the weighted draws [sd]."""
 
     def draws(self, most: int, rng: np.random.Generator) -> tuple[Matrix, Vector]:
-        """As many as they are worth and `most` at most, as many of every ensemble, and log densities."""
-        flat = self.chain.reshape(len(self.chain), -1, self.chain.shape[-1])
-        order = rng.permutation(flat.shape[1])[: max(1, int(min(most, self.worth)) // len(flat))]
-        about = self.log_density.reshape(len(flat), -1)[:, order].ravel()
-        return flat[:, order].reshape(-1, flat.shape[-1]), about
+        """Nearly independent draws, as many of every ensemble and `most` at most, and log densities."""
+        stride = max(1, ceil(_APART * self.log_density.size / max(self.worth, 1.0)))
+        flat = self.chain.reshape(len(self.chain), -1, self.chain.shape[-1])[:, ::stride]
+        about = self.log_density.reshape(len(flat), -1)[:, ::stride]
+        order = rng.permutation(flat.shape[1])[: max(1, most // len(flat))]
+        return flat[:, order].reshape(-1, flat.shape[-1]), about[:, order].ravel()
 
 
 def _walked(near: Posterior, first: Weighted, rng: np.random.Generator, mapped: Mapped) -> _Walk:

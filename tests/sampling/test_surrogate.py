@@ -134,7 +134,28 @@ def test_walkers_leave_weights_that_miss_a_part(weighted: tuple[Posterior, Weigh
     assert len(z) >= 300
     assert_allclose(about, near.log_density(z))
     sd = np.sqrt(whole @ (column - mean) ** 2)
-    assert abs(z[:, 1].mean() - mean) < 4 * sd * np.sqrt(1 / len(z) + 1 / walk.worth)
+    assert abs(z[:, 1].mean() - mean) < 4 * sd / np.sqrt(0.9 * len(z))
+
+
+def test_draws_of_a_walk_count_as_the_independent_ones_they_are_taken_for(rng: np.random.Generator):
+    """Of AR(1) walkers: the variance of a mean of as many draws as are taken, over that of independent ones.
+
+    Draws chosen at random, as many as the chain is worth, have twice that.
+    """
+    correlation, walkers, count, repeats = 0.9, 16, 120, 400
+    chain = np.empty((4, walkers, count, repeats))
+    chain[:, :, 0] = rng.standard_normal((4, walkers, repeats))
+    for k in range(1, count):
+        fresh = np.sqrt(1 - correlation**2) * rng.standard_normal((4, walkers, repeats))
+        chain[:, :, k] = correlation * chain[:, :, k - 1] + fresh
+    worth = chain[..., 0].size * (1 - correlation) / (1 + correlation)
+    walk = weightedrun._Walk(chain, chain[..., 0], worth, True, 0.0)
+    z, about = walk.draws(10_000, rng)
+    assert_allclose(about, z[:, 0])
+    assert len(z) > 0.6 * worth
+    ratio = len(z) * z.mean(axis=0).var()
+    assert ratio == pytest.approx(1 / 0.9, abs=4 * np.sqrt(2 / repeats))
+    assert len(walk.draws(40, rng)[0]) == 40
 
 
 def test_the_posterior_itself_is_asked_for_as_much_as_is_wanted(
