@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from time import monotonic
 
 import numpy as np
 from scipy.stats import chi2
@@ -34,11 +35,12 @@ from lcopa_bayes.sampling.weightedrun import weighted_run
 _DRAWS, _STREAM = 100, 13
 """Normal draws about an optimum [-], and the mark of their randomness."""
 LIMIT = 150.0
-"""Time for draws by a search, where the study states none [s]. That of three response axes took 77 s with two
-processes and gave reliable ones; ended after 40 s it gave none, and what is tried then took longer."""
+"""Time for draws of a plant without effects, where the study states none [s]. A search of three response
+axes took 77 s with two processes and gave reliable ones; ended after 40 s it gave none, and what is tried
+then took longer."""
 AROUND = 75.0
-"""The same for those around the optimum of a plant with effects [s]: what is drawn by then is used, and
-proposals for jitter of every record were fitted for ten minutes without coming close."""
+"""The same of a plant with effects [s]: what is drawn by then is used, and proposals for jitter of every
+record were fitted for ten minutes without coming close."""
 _SEARCHED = 6_000
 """Most samples of a plant that is searched [-]: of 10 700 of two axes a search took seven minutes of one
 processor, and ended without draws of the second axis."""
@@ -151,17 +153,18 @@ def _sampled(
     around the optima is not close to the posterior: it costs as much as three such proposals, and fails less
     often. It takes minutes, and is left to a fit, of many samples and under noise that is not Gaussian, where
     gains and offsets are searched too."""
-    posterior, plan = problem.posterior, plan_of(problem, quick=False)
+    posterior, plan, begin = problem.posterior, plan_of(problem, quick=False), monotonic()
     limit = LIMIT if posterior.simulation is None else AROUND
     plan = replace(plan, seconds=limit if plan.seconds is None else plan.seconds)
-    around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima)
+    # what is tried next has the time that those before it left
+    around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima, begin=begin)
     plain = posterior.simulation is None and isinstance(posterior.noise, GaussianNoise)
     if not (plain and optima):
         return around()
     first = around(attempts=1)
     if posterior.size > _SEARCHED or (first is not None and first[1].grade.level == "reliable"):
         return first
-    run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough)
+    run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough, begin=begin)
     return around() if run is None else (run, draws_of(posterior, run))
 
 

@@ -194,10 +194,12 @@ def by_search(
     *,
     jobs: int = 1,
     rough: Posterior | None = None,
+    begin: float | None = None,
 ) -> Run | None:
     """The importance draws that `sample` begins with, of every axis by itself where axes share nothing; None
-    where no search is possible or gives any. `optima`, one or more, and `rough` as there."""
-    begin, unfinished = monotonic(), False
+    where no search is possible or gives any. `optima`, one or more, and `rough` as there; the time of the
+    plan runs from `begin` (`time.monotonic`), by default from now."""
+    begin, unfinished = monotonic() if begin is None else begin, False
     rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
     left = partial(_left, plan, begin)
 

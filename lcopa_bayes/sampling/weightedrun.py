@@ -77,15 +77,16 @@ def weighted_run(
     quick: bool = False,
     optima: Sequence[Optimum] = (),
     attempts: int | None = None,
+    begin: float | None = None,
 ) -> tuple[Run, Draws] | None:
     """Importance draws as a run, and its draws; None where no weights are usable.
 
     `optima` are those of the posterior where they are known; else they are searched for. With `attempts` no
-    more proposals than these are fitted around them. Deterministic given
-    the plan's seed, whatever `jobs` [processes]; with a budget of `plan.seconds`, after which no further
-    proposal is fitted, on the speed of the machine too.
+    more proposals than these are fitted around them. Deterministic given the plan's seed, whatever `jobs`
+    [processes]; with a budget of `plan.seconds` from `begin` (`time.monotonic`), by default from now, after
+    which no further proposal is fitted, on the speed of the machine too.
     """
-    begin = monotonic()
+    begin = monotonic() if begin is None else begin
 
     def late() -> bool:
         return plan.seconds is not None and monotonic() > begin + plan.seconds

@@ -7,6 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.model.effects.commands import OverdrivePulse, RefreshHold
 from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.report.pages import write_page_of
@@ -215,15 +217,36 @@ def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close
     ("effects", "limit", "ways"), [((), explained.LIMIT, 3), (("trigger_jitter",), explained.AROUND, 1)]
 )
 def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated, effects, limit, ways):
-    """Around the optimum, by a search, and around it again; those with effects around it alone."""
+    """Around the optimum, by a search, and around it again, within one time; those with effects around it
+    alone."""
     plans: list[SamplePlan] = []
-    for way in ("weighted_run", "by_search"):
-        monkeypatch.setattr(explained, way, lambda posterior, plan, *_, **how: plans.append(plan))
+    begun: list[float] = []
+
+    def way(posterior, plan: SamplePlan, *_, begin: float, **how) -> None:
+        plans.append(plan)
+        begun.append(begin)
+
+    for name in ("weighted_run", "by_search"):
+        monkeypatch.setattr(explained, name, way)
     own = study(1)
     own = replace(own, sampler=replace(own.sampler, seconds=stated))
     own = replace(own, effects=replace(own.effects, use=effects))
     assert explained_draws(own, lambda draws, noise: True, quick=True) is None
     assert [plan.seconds for plan in plans] == [stated or limit] * ways
+    assert len(set(begun)) == 1
+
+
+def test_time_that_has_run_out_ends_what_is_tried_next():
+    """Of 100 s that began 99.9 s ago next to nothing is left: fewer draws than otherwise, and limited."""
+    posterior = problem_of(study(1)).posterior
+    plan = SamplePlan.of(posterior.dimension, seed=3, seconds=100.0)
+    optima = find_optima(posterior, np.random.default_rng(1), starts=1)
+    late = explained.by_search(posterior, plan, optima, begin=monotonic() - 99.9)
+    assert late is None or late.stopped_after > 99.9
+    result = explained.weighted_run(posterior, plan, optima=optima, begin=monotonic() - 200.0)
+    assert result is not None
+    assert result[0].stopped_after > 200.0
+    assert result[0].weighted.count < explained.weighted_run(posterior, plan, optima=optima)[0].weighted.count
 
 
 def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):
