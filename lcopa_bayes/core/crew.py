@@ -26,7 +26,7 @@ class Crew:
     def __init__(self, jobs: int = 1, *, after: float = 0.0, bar: Progress | None = None) -> None:
         """No process takes part yet; what they need is imported meanwhile. A `bar` counts tasks."""
         self.jobs, self._due, self._stack = jobs, monotonic() + after, ExitStack()
-        self._ended, self._bar = False, bar
+        self._bar = bar
         if jobs > 1:
             imported_ahead()
 
@@ -54,7 +54,7 @@ class Crew:
 
         def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
             result: Callable[[], R] = partial(task, shared, one)
-            if not self._ended and self.jobs > 1 and monotonic() >= self._due and common() is not None:
+            if self.jobs > 1 and monotonic() >= self._due and common() is not None:
                 result = partial(next, self._pool.each(work(task), [one]))
             return SimpleNamespace(result=self._counted(result))
 
@@ -81,10 +81,10 @@ class Crew:
     def _pool(self) -> Workers[None]:
         return self._stack.enter_context(workers(None, jobs=self.jobs))
 
-    def close(self) -> None:
-        """End the processes; from now on this one works alone."""
-        self._ended = True
+    def rest(self) -> None:
+        """End the processes, for a while in which others work; the next task starts them again."""
         self._stack.close()
+        vars(self).pop("_pool", None)
 
 
 _unpacked = Latest(1)

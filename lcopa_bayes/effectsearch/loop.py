@@ -40,6 +40,7 @@ from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
+from lcopa_bayes.results.sumsoflags import with_draws
 from lcopa_bayes.sampling.draws import Draws
 
 _WORTHWHILE = 2.0
@@ -321,7 +322,7 @@ class _Judged:
         drawn = None
         if options.sample and declarable(self.begun.study, self.state.model.effects):
             crew.stage(f"{self.verdict.kind}; drawing from the posterior")
-            crew.close()
+            crew.rest()
             drawn = self._drawn(jobs=crew.jobs, quick=options.quick)
         if drawn is not None and astray(self.after, drawn):
             drawn, cautions = None, (*cautions, _ASTRAY)
@@ -364,6 +365,6 @@ class _Judged:
             draws=None if sampled is None else sampled[0],
             loose=loose,
             open=alternatives(self.searched.state, self.searched.rounds) if weighs else (),
-            lags=lags,
+            lags=with_draws(lags, crew),
             plants=plants,
         )

@@ -37,6 +37,7 @@ from lcopa_bayes.results.sumsoflags import (
     sentence_of,
     weight_in,
     weights_of,
+    with_draws,
 )
 from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Grade, Limitation
 
@@ -44,6 +45,8 @@ _MOVED = 0.5
 """Shift of a median over its standard deviation from which a number counts as moved [-] ..."""
 _WIDER = 1.5
 """... as from this width of its interval over that of the fitted plant [-]."""
+_WORTHWHILE = 2.0
+"""Time that searches take from which processes share them [s]."""
 _SHOWN = 4
 """Most numbers named in a sentence."""
 
@@ -181,14 +184,14 @@ def _plant(fitted: Fit) -> FittedPlant | None:
 def with_alternatives(fitted: Fit, integer: IntegerFit | None, *, jobs: int = 1) -> Fit:
     """A fit with the figures of its step responses over all plants, that with `integer` orders among them,
     and what follows for its grade."""
-    own = _plant(fitted)
-    with Crew(min(jobs, len(own.noise)) if own else 1) as crew:
+    own, other = _plant(fitted), _plant(integer.draws) if integer else None
+    with Crew(jobs, after=_WORTHWHILE) as crew:
         found = lags_beside(own, crew=crew) if own else ()
+        if own and other:
+            found = held_against(found, own, replace(other, noise=own.noise))
+        found = with_draws(found, crew)
     if not found and integer is None:
         return fitted
-    other = _plant(integer.draws) if integer else None
-    if own and other:
-        found = held_against(found, own, replace(other, noise=own.noise))
     over = Alternatives(found, tuple(_numbers(fitted, found, integer)), integer)
     table = fitted.draws.table
     names = {}

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import islice
 from typing import Any, Literal, final
 
 import numpy as np
@@ -30,7 +31,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
-from lcopa_bayes.sampling.lagdraws import LagMixture
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagMixture, lag_draws, lag_tasks
 
 _SUPPORT = 10.0
 """Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
@@ -63,6 +64,8 @@ class Alternative:
     """Of the draws."""
     beside: tuple[PathSlot, ...] = ()
     """Paths to the same axis that stay as they are fitted."""
+    drawn: LagMixture | None = None
+    """Draws, where they are there already."""
 
     @property
     def search(self) -> LagSearch:
@@ -78,8 +81,8 @@ class Alternative:
 
     @cached_property
     def draws(self) -> LagMixture:
-        """Drawn where they are asked for."""
-        return LagMixture.of(self.searches, self.seed)
+        """Drawn where they are asked for, unless they are there."""
+        return self.drawn or LagMixture.of(self.searches, self.seed)
 
     @property
     def ess(self) -> float | None:
@@ -186,6 +189,21 @@ def held_against(
         return max(own - others, 0.0)
 
     return tuple(replace(one, advantage=one.advantage - worse(one)) for one in found)
+
+
+def with_draws(found: Sequence[Alternative], crew: Crew = ALONE) -> tuple[Alternative, ...]:
+    """The same with draws of those to which the records give any support; a `crew` draws all at once."""
+    tasks = [lag_tasks(one.searches, one.seed) if one.support != "plant" else [] for one in found]
+    each = crew.map(_drawn, [task for own in tasks for task in own])
+    parts = [list(islice(each, len(own))) for own in tasks]
+    return tuple(
+        replace(one, drawn=LagMixture.joined(own, one.seed)) if own else one
+        for one, own in zip(found, parts, strict=True)
+    )
+
+
+def _drawn(task: tuple[LagSearch, int, int, float]) -> LagDraws:
+    return lag_draws(*task)
 
 
 def sentence_of(found: Sequence[Alternative]) -> str:

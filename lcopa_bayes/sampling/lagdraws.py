@@ -103,9 +103,12 @@ class LagMixture:
     @classmethod
     def of(cls, searches: Sequence[LagSearch], seed: int) -> LagMixture:
         """As many draws of each search, and of each number of lags of one."""
+        return cls.joined([lag_draws(*task) for task in lag_tasks(searches, seed)], seed)
+
+    @classmethod
+    def joined(cls, drawn: Sequence[LagDraws], seed: int) -> LagMixture:
+        """As many draws of each kind."""
         rng = np.random.default_rng([seed, 1])
-        every = [(one, lags) for one in searches for lags in one.lags]
-        drawn = [lag_draws(one, lags, seed, _WANTED / len(every)) for one, lags in every]
         sizes = np.array([len(one.delays) for one in drawn])
         each = zip(np.cumsum(sizes) - sizes, sizes, strict=True)
         picked = [first + rng.choice(size, sizes.min(), replace=False) for first, size in each]
@@ -129,6 +132,12 @@ class LagMixture:
     def response(self, path: int, time: Vector) -> Matrix:
         """Response to a unit step at time 0, (draws, n)."""
         return np.asarray(np.concatenate([one.response(path, time) for one in self.parts])[self.picked])
+
+
+def lag_tasks(searches: Sequence[LagSearch], seed: int) -> list[tuple[LagSearch, int, int, float]]:
+    """What `lag_draws` is asked for, for each search and each number of lags of one."""
+    every = [(one, lags) for one in searches for lags in one.lags]
+    return [(one, lags, seed, _WANTED / len(every)) for one, lags in every]
 
 
 def lag_draws(search: LagSearch, lags: int, seed: int, wanted: float = _WANTED) -> LagDraws:

@@ -49,7 +49,7 @@ def test_no_process_is_started_before_it_pays(crew, monkeypatch):
 
 
 def test_what_no_other_process_can_import_is_done_here(monkeypatch):
-    """Of a stage only the tasks that need it, by their input or what they share; and all after the end."""
+    """Of a stage only the tasks that need it, by their input or what they share."""
     own = type("Own", (int,), {"__module__": "__main__"})
     monkeypatch.setattr(sys.modules["__main__"], "Own", own, raising=False)
     here = os.getpid()
@@ -57,11 +57,21 @@ def test_what_no_other_process_can_import_is_done_here(monkeypatch):
         made = list(crew.sharing(2).each(scaled, [1, own(2), np.float64(3.0)]))
         shared = list(crew.sharing(own(2)).each(scaled, [1]))
         local = list(crew.sharing(type("Local", (int,), {})(2)).each(scaled, [1]))
-        crew.close()
-        after = list(crew.sharing(2).each(scaled, [1]))
     assert [value for value, _ in made] == [2, 4, 6]
     assert [pid == here for _, pid in made] == [False, True, False]
-    assert shared == local == after == [(2, here)]
+    assert shared == local == [(2, here)]
+
+
+def test_processes_that_rest_have_ended_and_others_work_later():
+    with Crew(2) as crew:
+        crew.rest()  # nothing to end yet
+        ((_, first),) = crew.sharing(2).each(scaled, [1])
+        crew.rest()
+        with pytest.raises(ProcessLookupError):
+            os.kill(first, 0)
+        ((value, later),) = crew.sharing(2).each(scaled, [1])
+    assert value == 2
+    assert later not in (first, os.getpid())
 
 
 def test_errors_are_those_of_the_task():

@@ -20,7 +20,7 @@ from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.lags import figures_with_lags, fitted_plant, lags_of, linear_dynamics
 from lcopa_bayes.effectsearch.openeffects import step_figures
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.results.sumsoflags import Alternative, lags_beside, sentence_of
+from lcopa_bayes.results.sumsoflags import Alternative, lags_beside, sentence_of, with_draws
 
 RING = TransferPath.of_times(1.0, 0.4, (2.0, 0.8), (2.0, 1.0))
 """Second order, damping 0.2."""
@@ -138,7 +138,13 @@ def test_axes_that_are_searched_side_by_side_have_the_same_lags():
     base = fitted_base(Study("both", None, "s", 3, (run,), ()), (), as_stated=True, draws=100)
     alone = lags_of(base.start, base.problem)
     with Crew(2) as crew:
-        together = lags_of(base.start, base.problem, crew)
+        together = with_draws(lags_of(base.start, base.problem, crew), crew)
     assert [each.search.axis for each in alone] == [0, 1]
     assert [each.as_json() for each in together] == [each.as_json() for each in alone]
-    np.testing.assert_array_equal(together[1].draws.gains, alone[1].draws.gains)
+    assert all(each.drawn is None for each in alone)
+    for own, asked in zip(together, alone, strict=True):
+        assert own.drawn is own.draws
+        np.testing.assert_array_equal(own.draws.gains, asked.draws.gains)
+        np.testing.assert_array_equal(own.draws.delays, asked.draws.delays)
+    rejected = replace(alone[0], advantage=-1e3)
+    assert with_draws([rejected]) == (rejected,)  # draws that nothing asks for
