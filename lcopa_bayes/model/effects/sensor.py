@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import ClassVar, final
 
 import numpy as np
 from scipy.signal import lfilter
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
@@ -101,16 +102,26 @@ class Exposure(SensorEffect):
     def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Gauss quadrature with one node more than the exposure has blocks, at least four."""
         blocks = float(psi[0]) / scene.grid.step
-        nodes, weights = np.polynomial.legendre.leggauss(4 + int(abs(blocks)))
-        late = blocks * (1 + nodes) / 2
-        return np.asarray(sum(w / 2 * _shifted(y, shift) for w, shift in zip(weights, late, strict=True)))
+        nodes, weights = _gauss(4 + int(abs(blocks)))
+        return _delayed(y, blocks * (1 + nodes) / 2, weights / 2)
 
 
-def _shifted(y: Matrix, blocks: float) -> Matrix:
-    """``y`` at `blocks` blocks before, by cubics through four blocks; 0 before the first."""
-    whole = int(np.floor(blocks)) + 1
-    weights = (whole - blocks) ** np.arange(4.0) @ _CUBIC
-    n, reach = y.shape[1], abs(whole) + 2
-    padded = np.concatenate((np.zeros((y.shape[0], reach)), y, np.repeat(y[:, -1:], reach, axis=1)), axis=1)
-    first = reach - whole - 1
-    return np.asarray(sum(weights[k] * padded[:, first + k : first + k + n] for k in range(4)))
+@lru_cache
+def _gauss(count: int) -> tuple[Vector, Vector]:
+    """Nodes and weights of Gauss quadrature over -1 to 1, (count,) each [-]."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return frozen(nodes, name="nodes"), frozen(weights, name="weights")
+
+
+def _delayed(y: Matrix, blocks: Vector, weights: Vector) -> Matrix:
+    """Weighted sum of ``y``, (axes, blocks), at so many `blocks` before, by cubics through four blocks: 0
+    before the first, and as at the last one after it."""
+    latest = np.floor(blocks).astype(int) + 2
+    parts = weights[:, None] * ((latest - 1 - blocks)[:, None] ** np.arange(4.0) @ _CUBIC)
+    least, most = int(latest.min()) - 3, int(latest.max())
+    taps = np.zeros(most - least + 1)
+    np.add.at(taps, latest[:, None] - np.arange(4) - least, parts)
+    before, after = max(most, 0), max(-least, 0)
+    padded = np.pad(np.pad(y, ((0, 0), (before, 0))), ((0, 0), (0, after)), mode="edge")
+    first = before - most
+    return np.stack([np.convolve(own, taps, "valid")[first : first + y.shape[1]] for own in padded])
