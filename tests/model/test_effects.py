@@ -35,7 +35,7 @@ from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.model.effects.parallel import Backflow
 from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.model.effects.response import OddCurvature
-from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.model.effects.sensor import Exposure, SensorLag
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 
@@ -336,6 +336,29 @@ def test_sensor_lag_is_one_more_lag():
         reported = made.responses(values, np.array([lag]))[0][:, 0]
         assert np.abs(reported - exact).max() < 0.012  # the kink at the onset falls within a block
         assert np.abs(reported - exact)[t > 1.0].max() < 1e-3
+
+
+@pytest.mark.parametrize("exposure", [0.3, 1.0, 2.6, 17.25, -1.4])
+def test_an_exposure_is_the_mean_over_itself(exposure: float):
+    """Of cubics exactly, block by block; without a response before the first block, and as at the last one
+    after it."""
+    step, n = 0.5, 60
+    scene = SimpleNamespace(grid=SimpleNamespace(step=step))
+    at = step * np.arange(n)
+    cubics = np.array([[1.0, 0.0, 0.0, 0.0], [0.2, -1.0, 0.5, 0.03]])
+    read = Exposure().filtered(
+        np.array([np.polyval(one[::-1], at) for one in cubics]), scene, [step * exposure]
+    )
+    reach = int(np.ceil(abs(exposure))) + 2
+    inner = slice(reach, n - reach)
+    for one, own in zip(cubics, read, strict=True):
+        whole = np.polynomial.Polynomial(one).integ()
+        assert_allclose(
+            own[inner], ((whole(at) - whole(at - step * exposure)) / (step * exposure))[inner], rtol=1e-9
+        )
+    assert read[0, -1] == pytest.approx(1.0, abs=1e-12)
+    early = np.clip((at / step + 0.5) / exposure, 0.0, 1.0) if exposure > 0 else 1.0
+    assert_allclose(read[0], early, atol=0.6 / max(exposure, 1.0))
 
 
 @pytest.mark.parametrize(

@@ -114,14 +114,12 @@ def _gauss(count: int) -> tuple[Vector, Vector]:
 
 
 def _delayed(y: Matrix, blocks: Vector, weights: Vector) -> Matrix:
-    """Weighted sum of ``y``, (axes, blocks), at so many `blocks` before, by cubics through four blocks: 0
-    before the first, and as at the last one after it."""
+    """Weighted sum of ``y``, (axes, blocks), at so many `blocks` before, one of them less than a block away, by
+    cubics through four blocks: 0 before the first, and as at the last one after it."""
     latest = np.floor(blocks).astype(int) + 2
     parts = weights[:, None] * ((latest - 1 - blocks)[:, None] ** np.arange(4.0) @ _CUBIC)
-    least, most = int(latest.min()) - 3, int(latest.max())
-    taps = np.zeros(most - least + 1)
-    np.add.at(taps, latest[:, None] - np.arange(4) - least, parts)
-    before, after = max(most, 0), max(-least, 0)
+    before, after = int(latest.max()), 3 - int(latest.min())
+    taps = np.zeros(before + after + 1)
+    np.add.at(taps, after + latest[:, None] - np.arange(4), parts)
     padded = np.pad(np.pad(y, ((0, 0), (before, 0))), ((0, 0), (0, after)), mode="edge")
-    first = before - most
-    return np.stack([np.convolve(own, taps, "valid")[first : first + y.shape[1]] for own in padded])
+    return np.stack([np.convolve(own, taps, "valid") for own in padded])
