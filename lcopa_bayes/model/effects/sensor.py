@@ -114,8 +114,8 @@ def _gauss(count: int) -> tuple[Vector, Vector]:
 
 
 def _delayed(y: Matrix, blocks: Vector, weights: Vector) -> Matrix:
-    """Weighted sum of ``y``, (axes, blocks), at so many `blocks` before, one of them less than a block away, by
-    cubics through four blocks: 0 before the first, and as at the last one after it."""
+    """Weighted sum of ``y``, (axes, blocks), at so many `blocks` before, one of them less than a block away,
+    by cubics through four blocks: 0 before the first, and as at the last one after it."""
     latest = np.floor(blocks).astype(int) + 2
     parts = weights[:, None] * ((latest - 1 - blocks)[:, None] ** np.arange(4.0) @ _CUBIC)
     before, after = int(latest.max()), 3 - int(latest.min())
