@@ -4,7 +4,9 @@ A loop ends with one model. With one more effect, whose evidence chance could gi
 of one that it named, gains and delays are elsewhere, and the records say little against it: numbers are over
 all of these, weighted by evidence. One more effect is one linear step away: with whitened residual r and
 tangents J at the optimum, information H and signatures S over the prior sd of their coefficients psi,
-``psi ~ N(V S' r, V)``, ``1 / V = I + S' S - S' J G``, and coordinates move by ``-G psi``, ``G = H^-1 J' S``.
+``psi ~ N(V S' r, V)``, cut off at 0 where psi has one sign, ``1 / V = I + S' S - S' J G``, and coordinates
+move by ``-G psi``, ``G = H^-1 J' S``. What every reading has, an exposure and a lag of the sensor, looks like
+a delay: together they are as probable beforehand as none, and so are all other effects.
 Internal constants may have optima elsewhere, which no linear step reaches: the final model is fitted again
 from other instances of its effects.
 """
@@ -16,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
+from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
@@ -35,6 +38,8 @@ from lcopa_bayes.results.steps import curves_of, metrics_of
 
 LEAST = 3e-3
 """Weight beside that of the final model below which an alternative is left out [-]."""
+_ALWAYS = 0.5
+"""Odds beforehand of each of the two effects that every reading has [-]."""
 _CERTAIN = 300.0
 """Evidence beyond which odds do not grow [nat]."""
 _DRAWS = 4000
@@ -68,6 +73,9 @@ class Alternative:
     """Of its coordinates, those of the plant alone where an effect is replaced, (k,)."""
     root: Matrix
     """Factor of the covariance of that, (k, m)."""
+    least: float = -np.inf
+    """Where the coefficient of one more effect has one sign, the least of the standard normal that draws it
+    [-]."""
     instead: str = ""
     """Name of the effect that it stands in place of, whose coordinates it has if it is an instance of the
     same; empty for one more effect."""
@@ -86,7 +94,10 @@ class Alternative:
     def draws(self, own: Matrix, middle: Vector, rng: np.random.Generator) -> Matrix:
         """Coordinates, (draws, k), from draws of the final model about its optimum `middle`."""
         k = self.shift.size
-        scatter = rng.standard_normal((len(own), self.root.shape[1])) @ self.root.T
+        normal = rng.standard_normal((len(own), self.root.shape[1]))
+        if np.isfinite(self.least):
+            normal = norm.isf(norm.sf(self.least) * norm.sf(normal))
+        scatter = normal @ self.root.T
         return np.asarray((middle[:k] if self.instead else own) + self.shift + scatter)
 
 
@@ -198,14 +209,16 @@ def _beside(state: State, seen: Trace) -> list[Alternative]:
     for traced in seen.traced:
         for signature in traced.signatures:
             weight = odds(seen, seen.alone(signature)) / len(traced.signatures)
+            if traced.card.always:
+                weight *= _ALWAYS * len(seen.traced)
             if weight > LEAST:
-                shift, root = _step(state, signature, seen)
-                out.append(Alternative(traced.name, weight, shift, root))
+                out.append(Alternative(traced.name, weight, *_step(state, signature, seen)))
     return out
 
 
-def _step(state: State, signature: Signature, seen: Trace) -> tuple[Vector, Matrix]:
-    """What an instance of an effect moves coordinates by, and a factor of its covariance."""
+def _step(state: State, signature: Signature, seen: Trace) -> tuple[Vector, Matrix, float]:
+    """What an instance of an effect moves coordinates by, a factor of its covariance, and the least of the
+    standard normal behind it."""
     optimum, free = state.optimum, ~state.optimum.stuck
     raw, _ = state.model.signature(optimum.x, signature.effect)
     columns = state.whitening(raw.T).T * signature.width(seen.residual, seen.scale)
@@ -216,7 +229,9 @@ def _step(state: State, signature: Signature, seen: Trace) -> tuple[Vector, Matr
     left, moved = columns - optimum.jacobian @ gain, gain / state.model.spread[:, None]
     # equal to I + S' S - S' J G, whose difference may be lost in rounding
     covariance = covariance_of(np.eye(columns.shape[1]) + left.T @ left + moved.T @ moved)
-    return -gain @ (covariance @ (columns.T @ optimum.settled)), -gain @ root_of(covariance)
+    psi, root = covariance @ (columns.T @ optimum.settled), root_of(covariance)
+    least = -float(psi[0] / root[0, 0]) if signature.one_signed and psi.size == 1 else -np.inf
+    return -gain @ psi, -gain @ root, least
 
 
 def _instead(state: State, rounds: Sequence[Round]) -> list[Alternative]:
@@ -232,7 +247,7 @@ def _instead(state: State, rounds: Sequence[Round]) -> list[Alternative]:
             continue
         shift = one.optimum.x[:size] - state.optimum.x[:size]
         root = root_of(one.optimum.covariance[:size, :size])
-        out.append(Alternative(one.added[0], weight, shift, root, last.chosen.added[0]))
+        out.append(Alternative(one.added[0], weight, shift, root, instead=last.chosen.added[0]))
     return out
 
 
@@ -265,7 +280,7 @@ def _elsewhere(state: State, scale: Scale) -> list[Alternative]:
                 constants = (f"{key} {value:.3g}" for key, value in found.constants.items())
                 name, shift = f"{effect.name} with {', '.join(constants)}", there.x[own] - state.optimum.x
                 root = root_of(there.covariance[np.ix_(own, own)])
-                out.append(Alternative(name, weight, shift, root, effect.name, found))
+                out.append(Alternative(name, weight, shift, root, instead=effect.name, instance=found))
     return out
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import truncnorm
 from test_loop_joint import AXIS
 from test_loop_unseen import fitted
 
@@ -60,7 +61,8 @@ def test_one_linear_step_is_the_optimum_with_the_effect():
     state = replace(state, model=state.model.at_scales(state.optimum.x, {f"r{k}": 0.0 for k in range(2)}))
     seen = trace(state, [OverdrivePulse], np.random.default_rng(0), noise_samples=(500,), draws=400)
     (pulse,) = seen.traced
-    shift, root = _step(state, pulse.signature, seen)
+    shift, root, least = _step(state, pulse.signature, seen)
+    assert least == -np.inf
     assert pulse.signature.width(seen.residual, seen.scale) == 1.0
     model = state.model.having(pulse.signature.effect)
     best = Regression(model, state.whitening).descend(np.append(state.optimum.x, 0.0))
@@ -83,8 +85,8 @@ def test_what_only_the_prior_tells_apart_has_a_width_under_noise_of_nearly_nothi
             spread=state.model.spread, signature=lambda *_, k=k: (optimum.tangents[:, [k]], None)
         )
         clear = SimpleNamespace(model=same, whitening=white, optimum=optimum)
-        unit = SimpleNamespace(effect=None, width=lambda *_: 1.0)
-        _, root = _step(clear, unit, SimpleNamespace(residual=None, scale=None))
+        unit = SimpleNamespace(effect=None, width=lambda *_: 1.0, one_signed=False)
+        _, root, _ = _step(clear, unit, SimpleNamespace(residual=None, scale=None))
         # psi ~ N(0, 1) beside a coordinate of that spread, whose sum the records know
         expected = 1 / np.sqrt(1 + spread**-2)
         assert np.sqrt((root[k] ** 2).sum()) == pytest.approx(expected, rel=0.05)
@@ -148,6 +150,36 @@ def test_draws_outside_the_support_take_weight_away(faint: Loop):
     parts, weights = mixture(state, None, [one])
     assert weights[1] == pytest.approx(1 / 3, abs=0.02)
     assert (parts[1] >= state.model.bounds[0]).all()
+
+
+def test_a_coefficient_of_one_sign_moves_to_one_side(faint: Loop):
+    """Second method: moments of a normal cut off at 0, in closed form."""
+    rng, own = np.random.default_rng(2), np.zeros((40_000, 1))
+    for mean, sd in ((0.0, 1.0), (1.5, 0.8), (-2.0, 0.7)):
+        one = Alternative("a", 1.0, np.array([-3.0 * mean]), np.array([[-3.0 * sd]]), -mean / sd)
+        moved = one.draws(own, np.zeros(1), rng)[:, 0]
+        cut = truncnorm(-mean / sd, np.inf, mean, sd)
+        assert moved.max() <= 1e-9
+        assert moved.mean() == pytest.approx(-3.0 * cut.mean(), abs=4 * 3.0 * cut.std() / 200)
+        assert moved.std() == pytest.approx(3.0 * cut.std(), rel=0.03)
+
+
+def test_what_every_reading_has_is_as_probable_as_not(faint: Loop):
+    """A lag of the sensor too small to be seen, of a delay that it looks like: one sided, and of the weight
+    that its evidence gives even odds by half; the pulse shares the odds of all other effects."""
+    last = faint.rounds[-1].trace
+    lag = next(one for one in faint.open if one.name == "sensor_lag")
+    pulse = [one for one in faint.open if one.name == "overdrive_pulse"]
+    evidence = last.of("sensor_lag").log_bayes_factor
+    assert lag.weight == pytest.approx(0.5 * np.exp(evidence * CHANCE / last.threshold))
+    assert (
+        sum(one.weight for one in pulse)
+        < 1 / len(last.traced) * np.exp(last.of("overdrive_pulse").log_bayes_factor) + 1e-9
+    )
+    (k,) = faint.after.state.model.delays
+    own = np.tile(faint.after.state.optimum.x, (1000, 1))
+    later = lag.draws(own, own[0], np.random.default_rng(1))[:, k] - own[:, k]
+    assert later.max() <= 0.0  # a lag takes the place of a part of the delay
 
 
 def test_odds_are_those_of_the_evidence_even_where_a_float_does_not_hold_them():

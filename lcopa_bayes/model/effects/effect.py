@@ -132,6 +132,8 @@ class Card:
     """optical, thermal, electrical, mechanical: where it can occur; anywhere by default."""
     dynamics: bool = False
     """Whether it stands for any such response that the plant may lack."""
+    always: bool = False
+    """Whether every reading has it, however small."""
 
 
 @final

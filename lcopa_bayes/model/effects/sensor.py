@@ -37,6 +37,7 @@ class SensorLag(SensorEffect):
         reveals="pseudo-random drive; a test of the sensor with a fast source",
         mistaken_for="delay and order together (97 % of it)",
         linear=True,
+        always=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
@@ -93,6 +94,7 @@ class Exposure(SensorEffect):
         reveals="pseudo-random drive near the sampling limit",
         mistaken_for="delay of Te/2, to second order",
         linear=True,
+        always=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
