@@ -39,6 +39,7 @@ from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.effects.sensor import Exposure
 from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.results.sumsoflags import with_draws
 from lcopa_bayes.sampling.draws import Draws
@@ -358,13 +359,14 @@ class _Judged:
             lags = plants.held_against(lags, state, problem)
         # the noise of what remains holds any effect that may be open
         weighs = self.verdict.kind != "unexplained" and loose is None
+        known = Exposure.card.name if problem.study.exposure else ""
         return replace(
             loop,
             rounds=self.searched.rounds,
             groups=self.searched.groups if self.verdict.names else (),
             draws=None if sampled is None else sampled[0],
             loose=loose,
-            open=alternatives(self.searched.state, self.searched.rounds) if weighs else (),
+            open=alternatives(self.searched.state, self.searched.rounds, known) if weighs else (),
             lags=with_draws(lags, crew),
             plants=plants,
         )

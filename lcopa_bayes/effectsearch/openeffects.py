@@ -101,11 +101,12 @@ class Alternative:
         return np.asarray((middle[:k] if self.instead else own) + self.shift + scatter)
 
 
-def alternatives(state: State, rounds: Sequence[Round]) -> tuple[Alternative, ...]:
+def alternatives(state: State, rounds: Sequence[Round], known: str = "") -> tuple[Alternative, ...]:
     """Those of a final model that its last trace, of which no effect stands out, the refits of the round that
-    chose its last effect, and refits of other instances of its effects leave a weight."""
+    chose its last effect, and refits of other instances of its effects leave a weight. The size of the effect
+    `known` by name is stated with the records, as an exposure may be."""
     seen = rounds[-1].trace
-    return (*_beside(state, seen), *_instead(state, rounds), *_elsewhere(state, seen.scale))
+    return (*_beside(state, seen, known), *_instead(state, rounds), *_elsewhere(state, seen.scale))
 
 
 def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> tuple[list[Matrix], Vector]:
@@ -203,13 +204,13 @@ def odds(seen: Trace, log_bayes_factor: float) -> float:
     return float(np.exp(exponent)) / len(seen.traced)
 
 
-def _beside(state: State, seen: Trace) -> list[Alternative]:
+def _beside(state: State, seen: Trace, known: str) -> list[Alternative]:
     """One more effect beside those of the final model."""
     out = []
     for traced in seen.traced:
         for signature in traced.signatures:
             weight = odds(seen, seen.alone(signature)) / len(traced.signatures)
-            if traced.card.always:
+            if traced.card.always and traced.name != known:
                 weight *= _ALWAYS * len(seen.traced)
             if weight > LEAST:
                 out.append(Alternative(traced.name, weight, *_step(state, signature, seen)))

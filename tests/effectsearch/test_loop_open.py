@@ -16,7 +16,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.noiselaw import Law
-from lcopa_bayes.effectsearch.openeffects import Alternative, _step, mixture, odds
+from lcopa_bayes.effectsearch.openeffects import Alternative, _step, alternatives, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
@@ -176,6 +176,8 @@ def test_what_every_reading_has_is_as_probable_as_not(faint: Loop):
         sum(one.weight for one in pulse)
         < 1 / len(last.traced) * np.exp(last.of("overdrive_pulse").log_bayes_factor) + 1e-9
     )
+    stated = {one.name: one.weight for one in alternatives(faint.after.state, faint.rounds, "sensor_lag")}
+    assert stated.get("sensor_lag", 0.0) == pytest.approx(lag.weight / 0.5 / len(last.traced))
     (k,) = faint.after.state.model.delays
     own = np.tile(faint.after.state.optimum.x, (1000, 1))
     later = lag.draws(own, own[0], np.random.default_rng(1))[:, k] - own[:, k]
