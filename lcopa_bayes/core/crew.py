@@ -16,6 +16,8 @@ from lcopa_bayes.core.progress import Progress
 S = TypeVar("S")
 T = TypeVar("T")
 R = TypeVar("R")
+WORTHWHILE = 2.0
+"""Time that searches take from which processes share them [s]."""
 
 
 @final

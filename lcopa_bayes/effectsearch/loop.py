@@ -10,7 +10,7 @@ from typing import Self, final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.crew import Crew
+from lcopa_bayes.core.crew import WORTHWHILE, Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.wording import listed
@@ -44,8 +44,6 @@ from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.results.sumsoflags import with_draws
 from lcopa_bayes.sampling.draws import Draws
 
-_WORTHWHILE = 2.0
-"""Time that a search takes from which processes share it [s]."""
 _DRAWS = 2_000
 """Chance residuals [-]; half as many of a quick loop."""
 _ASTRAY = (
@@ -81,7 +79,7 @@ def loop(
     with (
         threadpool_limits(1),
         Progress(total=0, unit="task", quiet=quiet, desc="fitting the plant without effects") as bar,
-        Crew(jobs, after=_WORTHWHILE, bar=bar) as crew,
+        Crew(jobs, after=WORTHWHILE, bar=bar) as crew,
     ):
         options = _Options(crew, sample=sample, quick=quick, as_stated=as_stated)
         return _looped(study, kinds, options)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import truncnorm
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
@@ -94,9 +94,11 @@ class Alternative:
     def draws(self, own: Matrix, middle: Vector, rng: np.random.Generator) -> Matrix:
         """Coordinates, (draws, k), from draws of the final model about its optimum `middle`."""
         k = self.shift.size
-        normal = rng.standard_normal((len(own), self.root.shape[1]))
+        shape = len(own), self.root.shape[1]
         if np.isfinite(self.least):
-            normal = norm.isf(norm.sf(self.least) * norm.sf(normal))
+            normal = truncnorm.rvs(self.least, np.inf, size=shape, random_state=rng)
+        else:
+            normal = rng.standard_normal(shape)
         scatter = normal @ self.root.T
         return np.asarray((middle[:k] if self.instead else own) + self.shift + scatter)
 
@@ -195,23 +197,23 @@ def step_figures(
     return tuple(Weighed(one.name, one.unit, np.split(one.values, ends), share, one.note) for one in found)
 
 
-def odds(seen: Trace, log_bayes_factor: float) -> float:
-    """Of one more effect against none [-]: as probable beforehand as any other, and all together as none.
+def odds(seen: Trace, log_bayes_factor: float, beforehand: float | None = None) -> float:
+    """Of one more effect against none [-]: by default as probable `beforehand` as any other, and all together
+    as none.
 
     By what its evidence is worth, of more than `_CERTAIN` nat as of these, so that weights can be added up.
     """
     exponent = min(worth(log_bayes_factor, seen.threshold), _CERTAIN)
-    return float(np.exp(exponent)) / len(seen.traced)
+    return float(np.exp(exponent)) * (1 / len(seen.traced) if beforehand is None else beforehand)
 
 
 def _beside(state: State, seen: Trace, known: str) -> list[Alternative]:
     """One more effect beside those of the final model."""
     out = []
     for traced in seen.traced:
+        beforehand = _ALWAYS if traced.card.always and traced.name != known else None
         for signature in traced.signatures:
-            weight = odds(seen, seen.alone(signature)) / len(traced.signatures)
-            if traced.card.always and traced.name != known:
-                weight *= _ALWAYS * len(seen.traced)
+            weight = odds(seen, seen.alone(signature), beforehand) / len(traced.signatures)
             if weight > LEAST:
                 out.append(Alternative(traced.name, weight, *_step(state, signature, seen)))
     return out

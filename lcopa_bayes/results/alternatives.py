@@ -18,7 +18,7 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.crew import Crew
+from lcopa_bayes.core.crew import WORTHWHILE, Crew
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
 from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import listed
@@ -45,8 +45,6 @@ _MOVED = 0.5
 """Shift of a median over its standard deviation from which a number counts as moved [-] ..."""
 _WIDER = 1.5
 """... as from this width of its interval over that of the fitted plant [-]."""
-_WORTHWHILE = 2.0
-"""Time that searches take from which processes share them [s]."""
 _SHOWN = 4
 """Most numbers named in a sentence."""
 
@@ -185,7 +183,7 @@ def with_alternatives(fitted: Fit, integer: IntegerFit | None, *, jobs: int = 1)
     """A fit with the figures of its step responses over all plants, that with `integer` orders among them,
     and what follows for its grade."""
     own, other = _plant(fitted), _plant(integer.draws) if integer else None
-    with Crew(jobs, after=_WORTHWHILE) as crew:
+    with Crew(jobs if own else 1, after=WORTHWHILE) as crew:
         found = lags_beside(own, crew=crew) if own else ()
         if own and other:
             found = held_against(found, own, replace(other, noise=own.noise))

@@ -16,13 +16,13 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.noiselaw import Law
-from lcopa_bayes.effectsearch.openeffects import Alternative, _step, alternatives, mixture, odds
+from lcopa_bayes.effectsearch.openeffects import LEAST, Alternative, _step, alternatives, mixture, odds
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.model.effects.commands import OverdrivePulse
-from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.model.effects.sensor import Exposure, SensorLag
 from lcopa_bayes.results.averages import parts_of_sd, pooled
 
 DELAY, FRAME, SD = 3.0, 2.0, 0.02
@@ -152,7 +152,7 @@ def test_draws_outside_the_support_take_weight_away(faint: Loop):
     assert (parts[1] >= state.model.bounds[0]).all()
 
 
-def test_a_coefficient_of_one_sign_moves_to_one_side(faint: Loop):
+def test_a_coefficient_of_one_sign_moves_to_one_side():
     """Second method: moments of a normal cut off at 0, in closed form."""
     rng, own = np.random.default_rng(2), np.zeros((40_000, 1))
     for mean, sd in ((0.0, 1.0), (1.5, 0.8), (-2.0, 0.7)):
@@ -164,24 +164,35 @@ def test_a_coefficient_of_one_sign_moves_to_one_side(faint: Loop):
         assert moved.std() == pytest.approx(3.0 * cut.std(), rel=0.03)
 
 
-def test_what_every_reading_has_is_as_probable_as_not(faint: Loop):
-    """A lag of the sensor too small to be seen, of a delay that it looks like: one sided, and of the weight
-    that its evidence gives even odds by half; the pulse shares the odds of all other effects."""
-    last = faint.rounds[-1].trace
-    lag = next(one for one in faint.open if one.name == "sensor_lag")
-    pulse = [one for one in faint.open if one.name == "overdrive_pulse"]
-    evidence = last.of("sensor_lag").log_bayes_factor
-    assert lag.weight == pytest.approx(0.5 * np.exp(evidence * CHANCE / last.threshold))
-    assert (
-        sum(one.weight for one in pulse)
-        < 1 / len(last.traced) * np.exp(last.of("overdrive_pulse").log_bayes_factor) + 1e-9
-    )
-    stated = {one.name: one.weight for one in alternatives(faint.after.state, faint.rounds, "sensor_lag")}
-    assert stated.get("sensor_lag", 0.0) == pytest.approx(lag.weight / 0.5 / len(last.traced))
-    (k,) = faint.after.state.model.delays
-    own = np.tile(faint.after.state.optimum.x, (1000, 1))
+def test_what_every_reading_has_is_as_probable_as_not():
+    """Of an exposure and a lag of the sensor each has half the odds of none by its evidence, unless the study
+    states the exposure; the pulse has its share of those of all effects. A lag takes the place of a part of
+    the delay that it looks like."""
+    stated = replace(study_of(0.0), model=ModelSettings(offset="shared", exposure_ms=0.01))
+    library = [OverdrivePulse, SensorLag, Exposure]
+    clean = loop(stated, library=library, sample=False, quick=True, as_stated=True)
+    last, state = clean.rounds[-1].trace, clean.after.state
+    evidence = {
+        one.name: np.exp([last.alone(each) * CHANCE / last.threshold for each in one.signatures]).mean()
+        for one in last.traced
+    }
+
+    def assert_odds(found: tuple[Alternative, ...], **beforehand: float) -> None:
+        for name, own in beforehand.items():
+            weights, instances = [one.weight for one in found if one.name == name], last.of(name).signatures
+            light = (len(instances) - len(weights)) * LEAST  # instances that weigh less are left out
+            assert (
+                own * evidence[name] - light <= sum(weights) * (1 + 1e-9) <= own * evidence[name] * (1 + 2e-9)
+            )
+
+    assert_odds(clean.open, sensor_lag=0.5, exposure=1 / 3, overdrive_pulse=1 / 3)
+    assert_odds(alternatives(state, clean.rounds), sensor_lag=0.5, exposure=0.5, overdrive_pulse=1 / 3)
+    (lag,) = (one for one in clean.open if one.name == "sensor_lag")
+    (k,) = state.model.delays
+    own = np.tile(state.optimum.x, (1000, 1))
     later = lag.draws(own, own[0], np.random.default_rng(1))[:, k] - own[:, k]
-    assert later.max() <= 0.0  # a lag takes the place of a part of the delay
+    assert later.max() <= 0.0
+    assert later.min() < 0.0
 
 
 def test_odds_are_those_of_the_evidence_even_where_a_float_does_not_hold_them():
