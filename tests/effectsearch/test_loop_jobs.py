@@ -42,7 +42,7 @@ class Cubed(ReadoutEffect):
 def pools(monkeypatch):
     """Number of processes of each pool that is opened, and a search that opens one at once."""
     opened, plain = [], crew.workers
-    monkeypatch.setattr(loops, "_WORTHWHILE", 0.0)
+    monkeypatch.setattr(loops, "WORTHWHILE", 0.0)
     monkeypatch.setattr(crew, "workers", lambda *given, jobs: opened.append(jobs) or plain(*given, jobs=jobs))
     return opened
 
@@ -100,7 +100,7 @@ def test_an_effect_of_the_user_is_searched_in_this_process(pools, tmp_path):
 
 
 def test_a_short_search_starts_no_process(monkeypatch):
-    monkeypatch.setattr(loops, "_WORTHWHILE", 1e9)
+    monkeypatch.setattr(loops, "WORTHWHILE", 1e9)
     monkeypatch.setattr(crew, "workers", None)  # no call of it would end
     found = loop(study(2), library=LIBRARY[:1], jobs=2, sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "clean"
