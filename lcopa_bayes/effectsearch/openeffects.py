@@ -161,12 +161,12 @@ class Weighed:
     def as_json(self, *, ess: float, grade: str, interval: str) -> dict[str, Any]:
         """Median and 90 % interval, the standard deviations by noise and by structure, and lower end, median
         and upper end under the final model `alone`."""
-        made = Estimate.of(self.name, self.unit, self.values, ess=ess, grade=grade, note=self.note)
+        estimate = Estimate.of(self.name, self.unit, self.values, ess=ess, grade=grade, note=self.note)
         noise, structure = parts_of_sd(self.parts, self.weights)
-        tail = (1 - made.level) / 2
+        tail = (1 - estimate.level) / 2
         alone = [float(quantile(self.parts[0], at)) for at in (tail, 0.5, 1 - tail)]
         more = {"interval": interval, "sd_noise": noise, "sd_structure": structure, "alone": alone}
-        return plain(made.as_json() | more)
+        return plain(estimate.as_json() | more)
 
 
 def step_figures(

@@ -296,7 +296,8 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
             "the step responses are over the lags."
         )
     if given.missed is not None and given.missed.far:
-        confidence, nothing = "tentative", f"{nothing} But {given.missed.said}."
+        said = given.missed.said  # chance explains it, and contradicts nothing
+        confidence, nothing = "tentative", f"{nothing} {said[0].upper()}{said[1:]}."
     elif given.reached > REACHED:
         confidence = "tentative"
         nothing += (

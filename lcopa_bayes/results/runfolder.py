@@ -57,12 +57,12 @@ def opened(folder: Path | str | None, origin: Mapping[str, Any]) -> Iterator[Any
         return
     path = Path(folder)
     refuse_other(path, origin)  # before anything is made
-    made = [one for one in (path, *path.parents) if not one.exists()]
+    missing = [one for one in (path, *path.parents) if not one.exists()]
     try:
         with locked(writable_folder(path)):
             yield path
     except BaseException:
-        for one in made:  # what was refused leaves no folder
+        for one in missing:  # what was refused leaves no folder
             if one.is_dir() and not any(one.iterdir()):
                 one.rmdir()
         raise

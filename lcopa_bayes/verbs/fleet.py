@@ -46,7 +46,7 @@ _DEVICES, _DONE, _DRAWS, _ERROR = "devices", "device.json", "device.npy", "error
 the trace of an unforeseen error."""
 _TABLE, _EACH = "tables/fleet", "tables/devices.csv"
 """The table of the fleet, and that of every device and parameter by itself and given the others."""
-_TOLD, _MOST_TOLD = ("device", "grade", "differs_in", "p_odd", "verdict", "effects", "preferred"), 20
+_SHOWN, _MOST_SHOWN = ("device", "grade", "differs_in", "p_odd", "verdict", "effects", "preferred"), 20
 """Columns and most rows of the table that is printed; the whole one is a file."""
 
 
@@ -64,8 +64,8 @@ class FleetResult(StoredResult):
         return pd.DataFrame(self.values["devices"])
 
     def __str__(self) -> str:
-        told = self.summary().reindex(columns=_TOLD).dropna(axis="columns", how="all").head(_MOST_TOLD)
-        tables = [told, *([self.population()] if self.values["groups"] else [])]
+        devices = self.summary().reindex(columns=_SHOWN).dropna(axis="columns", how="all").head(_MOST_SHOWN)
+        tables = [devices, *([self.population()] if self.values["groups"] else [])]
         texts = [one.to_string(index=False, float_format=shown, na_rep="") for one in tables]
         return "\n\n".join([*texts, self.verdict])
 

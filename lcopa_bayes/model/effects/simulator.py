@@ -41,10 +41,10 @@ class Latest(OrderedDict[Hashable, _Value]):
     """The three values used last, so that what acts after the plant is evaluated without simulating it
     again."""
 
-    def get_or(self, key: Hashable, made: Callable[[], _Value]) -> _Value:
-        """The value of a key, made when it is not kept."""
+    def get_or(self, key: Hashable, compute: Callable[[], _Value]) -> _Value:
+        """The value of a key, computed when it is not kept."""
         if key not in self:
-            self[key] = made()
+            self[key] = compute()
         self.move_to_end(key)
         while len(self) > 3:
             self.popitem(last=False)
