@@ -1,5 +1,8 @@
 """Fixtures of all tests."""
 
+import os
+import sys
+
 import numpy as np
 import pytest
 
@@ -7,8 +10,11 @@ from lcopa_bayes.cli import keep_one_thread
 
 
 def pytest_configure() -> None:
-    """Workers of pytest-xdist inherit one thread each: with more they wait for each other."""
+    """Workers of pytest-xdist inherit one thread each: with more they wait for each other. Processes that
+    tests start read the package compiled, which takes a fifth of their start where none may keep it."""
     keep_one_thread()
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 @pytest.fixture

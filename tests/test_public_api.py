@@ -29,7 +29,7 @@ TINY = {"target_ess": 50}
 """Too short for numbers that hold, long enough for every table."""
 ON = record(1, camera=0.5, name="on")
 OFF = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
-FIXED = {"delay": 0.73, "order_1": 0.8}
+FIXED = {"delay": 0.73, "order_1": 0.8, "offset": 0.3}
 NOISE = {"kind": "white"}
 
 
@@ -37,6 +37,14 @@ def small(**more) -> lb.Study:
     return lb.Study(
         "small", fit=[ON], held_out=[OFF], terms=1, noise=NOISE, sampler=TINY, priors=FIXED, seed=5, **more
     )
+
+
+@pytest.fixture(scope="module")
+def short_benches():
+    """Designs try bench times of up to four spans of the records, not 400."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,7 @@ def comparison() -> lb.Comparison:
 
 
 @pytest.fixture(scope="module")
-def design(fit) -> lb.DesignResult:
+def design(fit, short_benches) -> lb.DesignResult:
     return lb.design(fit, bench_time=30.0, quick=True)
 
 
@@ -237,7 +245,7 @@ def test_candidates_by_name_and_studies_side_by_side(comparison):
                 model={"orders": (1.0,)},
                 noise=NOISE,
                 sampler=TINY,
-                priors={"delay": 0.73},
+                priors={"delay": 0.73, "offset": 0.3},
                 seed=5,
             ),
         ],

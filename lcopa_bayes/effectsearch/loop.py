@@ -329,7 +329,7 @@ class _Judged:
         problem = self.begun.base.problem
         after = drawn or (self.after if self.state is self.after.state else Side.of(problem, self.state))
         loop = self.begun.ending(self.verdict, self.before if self.verdict.names else after, after)
-        return self._weighed(replace(loop, cautions=cautions), crew)
+        return self._weighed(replace(loop, cautions=cautions), options)
 
     def _drawn(self, *, jobs: int, quick: bool) -> Side | None:
         """The final model by draws of the explained study; None where there are none."""
@@ -344,9 +344,9 @@ class _Judged:
         draws = explained_draws(explained, usable, near=known, jobs=jobs, quick=quick)
         return None if draws is None else Side.drawn(problem, state, draws)
 
-    def _weighed(self, loop: Loop, crew: Crew) -> Loop:
+    def _weighed(self, loop: Loop, options: _Options) -> Loop:
         """A loop with all that the records leave open beside its model."""
-        state, problem = self.state, loop.problem
+        state, problem, crew = self.state, loop.problem, options.crew
         sampled, loose = loop.after.state.sampled, None
         if sampled is None and state.widening is not None:
             optimum, white = settled(state.model, state.optimum, state.whitening)
@@ -365,6 +365,6 @@ class _Judged:
             draws=None if sampled is None else sampled[0],
             loose=loose,
             open=alternatives(self.searched.state, self.searched.rounds, known) if weighs else (),
-            lags=with_draws(lags, crew),
+            lags=with_draws(lags, crew) if options.sample else lags,
             plants=plants,
         )

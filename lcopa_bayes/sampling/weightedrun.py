@@ -191,7 +191,7 @@ def _by_surrogate(
     drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
     z, about = first.coordinates[drawn], first.log_density[drawn]
     if share < LEAST_EFFICIENCY or not usable(first):
-        walk = _walked(near, first, rng, mapped)
+        walk = _walked(near, first, rng, mapped, late)
         if not (walk.agree or usable(first)):
             return posterior, None, 0.0
         share = 1.0 if walk.agree else share
@@ -219,7 +219,7 @@ class _Walk:
     worth: float
     """Independent draws by the scatter within ensembles [-]."""
     agree: bool
-    """Whether the ensembles do."""
+    """Whether the ensembles do, at rest."""
     moved: float
     """Largest change of a mean from that of the weighted draws [sd]."""
 
@@ -232,8 +232,10 @@ class _Walk:
         return flat[:, order].reshape(-1, flat.shape[-1]), about[:, order].ravel()
 
 
-def _walked(near: Posterior, first: Weighted, rng: np.random.Generator, mapped: Mapped) -> _Walk:
-    """Draws of weighted ones moved on as ensembles of walkers until these agree and rest.
+def _walked(
+    near: Posterior, first: Weighted, rng: np.random.Generator, mapped: Mapped, late: Callable[[], bool]
+) -> _Walk:
+    """Draws of weighted ones moved on as ensembles of walkers until these agree and rest, or it is `late`.
 
     Resampling and moving (Gilks and Berzuini 2001, J. R. Statist. Soc. B 63): where the proposal misses part
     of the posterior the walkers leave for it, and the means move; their agreement tells whether they have
@@ -254,10 +256,11 @@ def _walked(near: Posterior, first: Weighted, rng: np.random.Generator, mapped: 
         chain = np.stack([one.chain for one in ensembles])
         kept = chain[:, 2 * chain.shape[1] // 5 :].swapaxes(1, 2)
         measured = qualities(names, kept)
-        agree = all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
-        # they set out together, so that they may agree on their way
         before, mean, sd = mean, kept.mean(axis=(0, 1, 2)), kept.std(axis=(0, 1, 2))
-        if agree and np.all(np.abs(mean - before) <= _MOVED * sd):
+        # they set out together, so that they may agree on their way
+        rest = bool(np.all(np.abs(mean - before) <= _MOVED * sd))
+        agree = rest and all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
+        if agree or late():
             break
     return _Walk(
         kept,

@@ -19,6 +19,7 @@ from lcopa_bayes.data.settings import CandidateSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.results.structure import structure_of
 from lcopa_bayes.verbs.compare import compare as compared
 
 
@@ -63,7 +64,17 @@ def ring_and_lag(**model: object) -> Study:
     )
 
 
-def test_terms_that_the_records_choose_for_each_element_are_a_candidate():
+def test_terms_that_the_records_choose_for_each_element_are_a_candidate(monkeypatch):
+    """A search that is asked for again, of the same study, is not made again."""
+    chosen: dict[str, object] = {}
+
+    def once(of: Study, **options: bool) -> object:
+        asked = repr((of.model, of.priors, of.noise, of.effects, options))
+        if asked not in chosen:
+            chosen[asked] = structure_of(of, **options)
+        return chosen[asked]
+
+    monkeypatch.setattr("lcopa_bayes.comparison.candidates.structure_of", once)
     own = ring_and_lag()
     found = {one.name: one for one in candidates_of(own)}
     one = found[BY_ELEMENT]

@@ -463,6 +463,10 @@ def test_what_chance_may_explain_is_said_beside_a_name():
     assert (disturbed.kind, disturbed.confidence) == ("disturbance", "firm")
     assert "by chance" in disturbed.sentence
     assert "chance" not in decide(replace(FOUND, missed=Miss("y", 1.0, 0.9, 0.3))).sentence
+    quiet = decide(replace(FOUND, alarmed=False, effects=(), gained=0.0, missed=Miss("y", 1.2, 0.84, 0.93)))
+    assert (quiet.kind, quiet.confidence) == ("clean", "tentative")
+    assert "On unseen records the error of y is 1.20" in quiet.sentence
+    assert "But" not in quiet.sentence
 
 
 def test_something_that_is_missing_is_not_said_to_be_nothing():

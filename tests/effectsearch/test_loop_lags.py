@@ -99,6 +99,7 @@ def test_what_stays_unexplained_keeps_its_sums_of_lags(monkeypatch: pytest.Monke
     assert found.verdict.kind == "unexplained"
     (one,) = found.lags
     assert one.support == "both"
+    assert one.drawn is None  # without `sample` they are drawn where they are asked for
     parts = {}
     for name, each in (("over", found), ("without", replace(found, lags=()))):
         parts[name] = next(len(figure.parts) for figure in each.figures if figure.name == "delay[x]")

@@ -7,6 +7,7 @@ import signal
 import sys
 import tomllib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Timer
 
@@ -128,12 +129,20 @@ def test_finished_devices_are_kept_until_their_study_changes(devices, out, fleet
     assert [one.name for one in studies] == list(GAINS)
 
 
-def test_the_numbers_of_a_device_are_computed_once(devices, tmp_path, monkeypatch):
-    counts, compute = [], fits.results
-    monkeypatch.setattr(fits, "results", lambda fit: counts.append(fit.study.name) or compute(fit))
-    row = lb.fleet([devices / "a"], folder=tmp_path).summary().iloc[0]
-    assert counts == ["a"]
-    assert row["gain"] == lb.load_result(tmp_path / "devices" / "a").to_json()["parameters"][0]["value"]
+@pytest.fixture(scope="module")
+def alone(devices, tmp_path_factory) -> tuple[lb.FleetResult, list[str], Path]:
+    """The fleet by one process, the devices whose numbers were computed, and the run folder."""
+    counts, compute, folder = [], fits.results, tmp_path_factory.mktemp("alone")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fits, "results", lambda fit: counts.append(fit.study.name) or compute(fit))
+        return lb.fleet(devices, folder=folder), counts, folder
+
+
+def test_the_numbers_of_a_device_are_computed_once(alone):
+    found, counts, folder = alone
+    assert counts == list(GAINS)
+    row = found.summary().set_index("device").loc["a"]
+    assert row["gain"] == lb.load_result(folder / "devices" / "a").to_json()["parameters"][0]["value"]
 
 
 def test_a_folder_that_takes_no_devices_is_refused_once(devices, tmp_path):
@@ -183,8 +192,8 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_table(fleet, devices,
     assert without_times(lost) == without_times(fleet)
 
 
-def test_processes_change_no_number(fleet, devices):
-    assert without_times(lb.fleet(devices)) == without_times(fleet)
+def test_processes_change_no_number(fleet, alone):
+    assert without_times(alone[0]) == without_times(fleet)
 
 
 def test_a_population_is_the_prior_of_the_next_study(fleet, out, devices, tmp_path):
@@ -230,9 +239,10 @@ def broken_row(*args: object) -> None:
     raise ZeroDivisionError("nothing to divide by")
 
 
-def test_an_unforeseen_error_is_listed_with_its_details(devices, tmp_path, monkeypatch):
+def test_an_unforeseen_error_is_listed_with_its_details(devices, out, fleet, tmp_path, monkeypatch):
     """It ends the device, not the fleet; where no device is left it is said."""
-    study = lb.load_study(devices / "a")
+    study, fitted = lb.load_study(devices / "a"), lb.load_result(out / "devices" / "a")
+    monkeypatch.setitem(verb._VERBS, "fit", lambda *_, **__: fitted)
     monkeypatch.setattr(verb, "row_of", broken_row)
     with pytest.raises(
         lb.InputError, match=r"not one of 1 devices could be done; the first, a: unforeseen Zero"
@@ -382,6 +392,7 @@ def test_the_bench_makes_a_fleet_of_a_known_population_with_odd_devices(tmp_path
 def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path, monkeypatch):
     few = [catalogue()[name] for name in ("odd_curvature", "gain_drift", "unmodelled_smooth")]
     monkeypatch.setattr("lcopa_bayes.effectsearch.loop.offered", lambda study: few)
+    monkeypatch.setitem(verb._VERBS, "loop", partial(lb.loop, as_stated=True))
     found = lb.fleet([lb.load_study(devices / "a")], "loop", quick=True, folder=tmp_path)
     (row,) = found.summary().to_dict("records")
     own = lb.load_result(tmp_path / "devices" / "a", "loop")

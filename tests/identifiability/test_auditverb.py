@@ -50,8 +50,11 @@ def study(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(study) -> Path:
-    folder = study / "run"
-    assert main(["audit", str(study), "--quick", "--jobs", "1", "--quiet", "--out", str(folder)]) == 0
+    """With empty figures."""
+    folder, empty = study / "run", '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"></svg>'
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: empty)
+        assert main(["audit", str(study), "--quick", "--jobs", "1", "--quiet", "--out", str(folder)]) == 0
     return folder
 
 
@@ -97,6 +100,7 @@ def test_resumed_and_in_two_processes_it_says_the_same(study, run, capsys):
     assert printed == json.loads(before)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_claims_read_an_audit(run, tmp_path, capsys):
     assert main(["claims", "--audit", str(run), "--out", str(tmp_path), "--json"]) == 0
     rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["claims"]}
@@ -168,6 +172,7 @@ def test_the_first_audit_that_can_answer_decides():
     assert judged["I1"].how.startswith("Audit of the study one path")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_audits_of_bundled_studies_are_read_where_they_are(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "reports" / "paper-step"

@@ -21,9 +21,18 @@ from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.papers import optics
 
 TINY = {"target_ess": 50}
-KNOWN = {"delay": 0.73, "order_1": 0.8}
+PLANT = {"delay": 0.73, "order_1": 0.8}
+KNOWN = PLANT | {"offset": 0.3}
 ON = record(1, camera=0.5, name="on")
 OFF = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_benches():
+    """Designs try bench times of up to four spans of the records, not 400."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +138,7 @@ def test_a_design_and_its_drive_are_drawn(fit):
 
 
 def test_residuals_before_and_after_are_those_of_the_loop():
-    found = lb.loop(study(ON, OFF, priors=KNOWN, sampler=TINY), quick=True, as_stated=True)
+    found = lb.loop(study(ON, OFF, priors=PLANT, sampler=TINY), quick=True, as_stated=True)
     figure = lb.plot.before_after(found, record="off")
     for panel, when in zip(figure.axes, ("before", "after"), strict=True):
         assert panel.get_title("left") == f"off, y: {when}"

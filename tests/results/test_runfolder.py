@@ -50,11 +50,10 @@ def folder(fitted, tmp_path_factory):
 
 
 @pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
-@pytest.mark.parametrize(
-    "fitted", ["white", pytest.param("student", marks=pytest.mark.slow)], indirect=True, scope="module"
-)
-def test_a_page_drawn_while_the_rest_is_written_is_that_of_the_folder(fitted, tmp_path, jobs):
-    fitted.save(tmp_path, jobs=jobs, page=True)
+@pytest.mark.parametrize("noise", ["white", pytest.param("student", marks=pytest.mark.slow)])
+def test_a_page_drawn_while_the_rest_is_written_is_that_of_the_folder(tmp_path, noise, jobs):
+    made = fit(study(record(camera=0.8, name="a"), noise=noise, sampler=TINY, priors=KNOWN))
+    made.save(tmp_path, jobs=jobs, page=True)
     page = tmp_path / "report.html"
     before = page.read_bytes()
     assert b'href="posterior.nc"' in before

@@ -39,6 +39,14 @@ SEARCHES = ("compare", "loop")
 """Verbs that fit many models."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_benches():
+    """Designs try bench times of up to four spans of the records, not 400."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
+        yield
+
+
 def written(study: Study, folder: Path) -> Path:
     """The folder with the study, and a drive that steps once in each of its axes."""
     write_study(study, folder / "study.toml")
@@ -130,7 +138,7 @@ def test_units_of_time_change_only_times():
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("leaving", [SEARCHES, pytest.param((), marks=pytest.mark.slow)])
 def test_every_verb_answers(leaving, tmp_path, capsys):
-    known = {"priors": {"delay": 0.1}} if leaving else {}
+    known = {"priors": {"delay": 0.1, "order_1": 1.0}} if leaving else {}
     study = Shape(samples=24, records=1, dark=True, settings=PLAIN | known).study()
     said = answers(capsys, written(study, tmp_path), pick=PAIR, leaving=leaving)
     assert not [verb for verb, values in said.items() if "errors" in values]
