@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -27,3 +28,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Empty figures, for what a page says in words."""
     empty = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"></svg>'
     monkeypatch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: empty)
+
+
+@pytest.fixture(scope="module")
+def short_benches() -> Iterator[None]:
+    """Designs try bench times of up to four spans of the records, not 400."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
+        yield

@@ -40,14 +40,6 @@ def small(**more) -> lb.Study:
 
 
 @pytest.fixture(scope="module")
-def short_benches():
-    """Designs try bench times of up to four spans of the records, not 400."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
-        yield
-
-
-@pytest.fixture(scope="module")
 def fit() -> lb.Fit:
     return lb.fit(small(), jobs=2)
 

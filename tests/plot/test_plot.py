@@ -20,19 +20,12 @@ from lcopa_bayes.plot.theme import BAND, StyledFigure, look
 from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.papers import optics
 
+pytestmark = pytest.mark.usefixtures("short_benches")
 TINY = {"target_ess": 50}
 PLANT = {"delay": 0.73, "order_1": 0.8}
 KNOWN = PLANT | {"offset": 0.3}
 ON = record(1, camera=0.5, name="on")
 OFF = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_benches():
-    """Designs try bench times of up to four spans of the records, not 400."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
 
+pytestmark = pytest.mark.usefixtures("short_benches")
 PLAIN = {"model": {"terms": 1}, "noise": {"kind": "white"}, "sampler": {"target_ess": 40}}
 """Settings with which a verb takes seconds."""
 SEARCHED = {
@@ -37,14 +38,6 @@ LOOKED_AT += ("microseconds, dark record",)
 PAIR = ("--pick", "first-order", "fractional-1")
 SEARCHES = ("compare", "loop")
 """Verbs that fit many models."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_benches():
-    """Designs try bench times of up to four spans of the records, not 400."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lcopa_bayes.experiments.candidates.SPANS", (1, 2, 4))
-        yield
 
 
 def written(study: Study, folder: Path) -> Path:
