@@ -33,7 +33,7 @@ from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, sig
 from lcopa_bayes.effectsearch.trace import Trace, worth
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
-from lcopa_bayes.results.averages import parts_of_sd, pooled
+from lcopa_bayes.results.averages import parts_of_sd, pooled, pooled_parts
 from lcopa_bayes.results.steps import curves_of, metrics_of
 
 LEAST = 3e-3
@@ -162,7 +162,7 @@ class Weighed:
         """Median and 90 % interval, the standard deviations by noise and by structure, and lower end, median
         and upper end under the final model `alone`."""
         estimate = Estimate.of(self.name, self.unit, self.values, ess=ess, grade=grade, note=self.note)
-        noise, structure = parts_of_sd(self.parts, self.weights)
+        noise, structure = parts_of_sd(*pooled_parts(self.parts, self.weights))
         tail = (1 - estimate.level) / 2
         alone = [float(quantile(self.parts[0], at)) for at in (tail, 0.5, 1 - tail)]
         more = {"interval": interval, "sd_noise": noise, "sd_structure": structure, "alone": alone}

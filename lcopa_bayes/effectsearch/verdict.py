@@ -10,7 +10,7 @@ from typing import Literal, final
 from scipy.stats import norm
 
 from lcopa_bayes.core.estimate import HALF_WIDTH
-from lcopa_bayes.core.wording import listed
+from lcopa_bayes.core.wording import joined, listed
 
 Kind = Literal["clean", "explained", "partly explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
@@ -296,8 +296,8 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
             "the step responses are over the lags."
         )
     if given.missed is not None and given.missed.far:
-        said = given.missed.said  # chance explains it, and contradicts nothing
-        confidence, nothing = "tentative", f"{nothing} {said[0].upper()}{said[1:]}."
+        # chance explains it, and it contradicts nothing
+        confidence, nothing = "tentative", f"{nothing} {joined([given.missed.said])}"
     elif given.reached > REACHED:
         confidence = "tentative"
         nothing += (

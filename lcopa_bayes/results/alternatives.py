@@ -24,7 +24,7 @@ from lcopa_bayes.core.units import measured
 from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.diffusion import KINDS, Kind
 from lcopa_bayes.inference.noise import GaussianNoise
-from lcopa_bayes.results.averages import parts_of_sd, pooled
+from lcopa_bayes.results.averages import parts_of_sd, pooled, pooled_parts
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.integerfit import IntegerFit
 from lcopa_bayes.results.steps import Metric, metrics_of
@@ -95,7 +95,7 @@ class Averaged:
         """Plain values: the estimate, its parts, and what each plant says by itself."""
         alone = {one: _ends_and_median(self.parts[one]) if one in self.parts else None for one in _SAID}
         shares = np.array([self.shares[one] for one in self.parts])
-        noise, structure = parts_of_sd(list(self.parts.values()), shares)
+        noise, structure = parts_of_sd(*pooled_parts(list(self.parts.values()), shares))
         parts = {"shares": dict(self.shares), "sd_noise": noise, "sd_structure": structure}
         return self.estimate.as_json() | alone | parts
 

@@ -15,28 +15,29 @@ _DRAWS = 4000
 def pooled(values: Sequence[Vector], weights: Vector) -> Vector:
     """Equally probable values of a mixture whose parts are given by equally probable values, perhaps
     infinite."""
-    return np.concatenate(_pooled_parts(values, weights))
+    return np.concatenate(pooled_parts(values, weights)[0])
+
+
+def pooled_parts(values: Sequence[Vector], weights: Vector) -> tuple[list[Vector], Vector]:
+    """The `pooled` values of each part, in which one draw far out does not count, and the shares of the
+    parts; a part that has less than one value is left out."""
+    counts = np.round(_DRAWS * weights).astype(int)
+    pairs = zip(values, counts, strict=True)
+    parts = [_spread(one, (np.arange(n) + 0.5) / n) for one, n in pairs if n]
+    return parts, counts[counts > 0] / counts.sum()
 
 
 def parts_of_sd(values: Sequence[Vector], weights: Vector) -> tuple[float, float]:
     """Standard deviation within and between the components of a mixture, each given by equally probable
-    values; NaN where a component with a weight is open. Their squares add up to the variance of the values
-    that are `pooled`, which one draw far out does not decide."""
-    if not all(np.isfinite(one).all() for one, weight in zip(values, weights, strict=True) if weight > 0):
+    values; NaN where a component with a weight is open. Their squares add up to the mixture's variance."""
+    kept = [(one, weight) for one, weight in zip(values, weights, strict=True) if weight > 0]
+    if not all(np.isfinite(one).all() for one, _ in kept):
         return np.nan, np.nan
-    parts = _pooled_parts(values, weights)
-    share = np.array([one.size for one in parts]) / sum(one.size for one in parts)
-    means = np.array([one.mean() for one in parts])
-    within = float(share @ np.array([one.var() for one in parts]))
+    share = np.array([weight for _, weight in kept])
+    means = np.array([one.mean() for one, _ in kept])
+    within = float(share @ np.array([one.var() for one, _ in kept]))
     between = float(share @ (means - share @ means) ** 2)
     return float(np.sqrt(within)), float(np.sqrt(between))
-
-
-def _pooled_parts(values: Sequence[Vector], weights: Vector) -> list[Vector]:
-    """Values of each part, as many as its weight stands for; none of a part that stands for less than one."""
-    counts = np.round(_DRAWS * weights).astype(int)
-    pairs = zip(values, counts, strict=True)
-    return [_spread(one, (np.arange(n) + 0.5) / n) for one, n in pairs if n]
 
 
 def _spread(values: Vector, places: Array) -> Vector:

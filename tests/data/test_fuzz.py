@@ -45,7 +45,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # xarray leaves files open
 ]
 CORPUS = Path(__file__).parent / "corpus"
-DEFAULT = 2_000
+DEFAULT = 4_000
 INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", DEFAULT))
 MOST = 5.0
 """Longest time that one input may take [s]."""

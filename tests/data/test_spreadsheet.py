@@ -427,7 +427,7 @@ CELLS = st.one_of(
     separator=st.sampled_from(",;\t|"),
     content=st.none() | st.binary(max_size=200),
 )
-@settings(max_examples=75, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_table_is_read_or_refused_in_words(header, rows, separator, content, tmp_path):
     path = tmp_path / "x.csv"
     if content is None:

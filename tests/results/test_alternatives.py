@@ -13,9 +13,11 @@ from inference.test_lagsum import DELAY, GAINS, SD, TIMES, lags, made
 from small import record, study
 
 from lcopa_bayes.bench.command import step
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.results.alternatives import Alternatives, alternatives_of, with_alternatives
-from lcopa_bayes.results.averages import parts_of_sd, pooled
+from lcopa_bayes.effectsearch.openeffects import Weighed
+from lcopa_bayes.results.alternatives import Alternatives, Averaged, alternatives_of, with_alternatives
+from lcopa_bayes.results.averages import parts_of_sd, pooled, pooled_parts
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerfit import integer_fit
@@ -144,7 +146,9 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
     every = np.concatenate([np.repeat(ours, theirs.size), np.repeat(theirs, ours.size)])
     assert number.estimate.lower == pytest.approx(float(np.quantile(every, 0.05)), rel=0.02)
     noise, structure = parts_of_sd([ours, theirs], np.array([0.5, 0.5]))
-    assert noise**2 + structure**2 == pytest.approx(number.estimate.sd**2, rel=1e-3)
+    assert noise**2 + structure**2 == pytest.approx(float(np.var(every)), rel=1e-6)
+    shown = number.as_json()
+    assert np.hypot(shown["sd_noise"], shown["sd_structure"]) == pytest.approx(shown["sd"], rel=1e-3)
 
 
 def test_a_number_that_moves_limits_its_parameter_alone() -> None:
@@ -185,10 +189,25 @@ def test_the_square_of_the_parts_is_the_variance_of_the_mixture() -> None:
     values = [rng.normal(0, 1, 4000), rng.normal(2, 3, 4000)]
     weights = np.array([0.25, 0.75])
     noise, structure = parts_of_sd(values, weights)
-    assert noise**2 + structure**2 == pytest.approx(pooled(values, weights).var(), rel=1e-12)
     means = np.array([one.mean() for one in values])
     second = weights @ np.array([np.mean(one**2) for one in values])
-    assert noise**2 + structure**2 == pytest.approx(float(second - (weights @ means) ** 2), rel=0.01)
-    stray = [np.append(values[0], 1e4), values[1]]  # one draw far out, by which the raw variance is 6e3
-    assert parts_of_sd(stray, weights) == pytest.approx((noise, structure), rel=0.01)
+    assert noise**2 + structure**2 == pytest.approx(float(second - (weights @ means) ** 2))
     assert np.isnan(parts_of_sd([np.array([1.0, np.inf]), values[0]], weights)).all()
+
+
+def test_one_draw_far_out_makes_no_part_larger_than_the_whole() -> None:
+    rng = np.random.default_rng(1)
+    values, weights = [rng.normal(0, 1, 4000), rng.normal(2, 3, 4000)], np.array([0.25, 0.75])
+    stray = [np.append(values[0], 1e4), values[1]]  # by which the variance of all draws is 6e3
+    whole = pooled(stray, weights)
+    noise, structure = parts_of_sd(*pooled_parts(stray, weights))
+    assert noise**2 + structure**2 == pytest.approx(whole.var(), rel=1e-12)
+    assert (noise, structure) == pytest.approx(parts_of_sd(values, weights), rel=0.01)
+    estimate = Estimate.of("a", "V", whole, ess=100.0, grade="reliable", note="")
+    kinds = ("plant", "lags")
+    averaged = Averaged(
+        estimate, dict(zip(kinds, stray, strict=True)), dict(zip(kinds, weights, strict=True))
+    )
+    weighed = Weighed("a", "V", stray, weights).as_json(ess=100.0, grade="reliable", interval="Laplace")
+    for shown in (averaged.as_json(), weighed):
+        assert np.hypot(shown["sd_noise"], shown["sd_structure"]) == pytest.approx(shown["sd"], rel=1e-3)
