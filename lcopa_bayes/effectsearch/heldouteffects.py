@@ -18,8 +18,6 @@ from lcopa_bayes.effectsearch.verdict import Miss
 
 _ROOM = 0.05
 """Share of the range of a drive beyond which a model extrapolates [-]."""
-_SIMULATED = 400
-"""Errors that are simulated, with the draws of a prediction by turns [-]."""
 _SEEN = float(norm.sf(5.0))
 """p-value of noise alone below which error beyond noise is judged, five normal standard deviations [-]."""
 _PROCESSES = 400
@@ -99,9 +97,8 @@ class _Known:
 
     @classmethod
     def of(cls, fit: Sequence[Score], scores: Sequence[Score], state: State, axis: int) -> Self:
-        noise = ResidualNoise.of(state, axis, _SIMULATED, np.random.default_rng([_SEED, axis]))
         name = scores[0].axis
-        return cls(name, max(pooled_rmse(fit, name), scores[0].noise_sd), noise)
+        return cls(name, max(pooled_rmse(fit, name), scores[0].noise_sd), state.residual_noise[axis])
 
     def missed(self, study: Study, scores: Sequence[Score], *, beyond: bool) -> Miss | None:
         """Errors inside the drive range of the other records, or beyond it; None without a sample there."""
@@ -114,7 +111,7 @@ class _Known:
             assert one.draws is not None
             error, half = (one.observed - one.predicted)[counted], one.half_width[counted]
             drawn = self.noise.draw(one.time[counted], rng)
-            by_turns = np.arange(_SIMULATED) % len(one.draws)
+            by_turns = np.arange(len(drawn)) % len(one.draws)
             drawn += self.noise.widening[:, None] * one.draws[by_turns][:, counted]
             seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn, half)
             count += error.size

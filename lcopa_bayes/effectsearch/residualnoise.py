@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from typing import Self, final
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import t as student
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL
 from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import joint_noise
 from lcopa_bayes.effectsearch.noiselaw import Law, plausible_in_residual, single_correlation
 from lcopa_bayes.effectsearch.regression import Optimum
-from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.whitening import parts
+from lcopa_bayes.effectsearch.whitening import Whitening, parts
 from lcopa_bayes.inference.noise import Student
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.recursions import correlated
@@ -23,6 +26,22 @@ _FREEDOM = np.array([2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0, 1e6])
 """Degrees of freedom of Student's law that are tried, the last those of a normal one [-]."""
 _STEPS = 100
 """Steps to the likeliest scale of each [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class BandScales:
+    """Scales of a pointwise 90 % band around a prediction, where noise is known with an uncertainty."""
+
+    noise: float
+    """Standard deviation of the normal noise that as wide a band holds [response unit]."""
+    prediction: float = 1.0
+    """Factor on the standard deviation of what the fit leaves uncertain [-]."""
+
+    def half_width(self, variance: Vector) -> Vector:
+        """Half the width of the band with noise at a variance of the prediction, same shape [response
+        unit]."""
+        return np.asarray(HALF_WIDTH * np.sqrt(self.prediction**2 * variance + self.noise**2))
 
 
 @final
@@ -43,9 +62,17 @@ class ResidualNoise:
     """Sampling period [time unit]."""
 
     @classmethod
-    def of(cls, state: State, axis: int, count: int, rng: np.random.Generator) -> Self:
-        """So many draws given the fitted records."""
-        plant, optimum = state.model.plant, state.optimum
+    def of(
+        cls,
+        model: ExtendedModel,
+        optimum: Optimum,
+        whitening: Whitening,
+        axis: int,
+        count: int,
+        rng: np.random.Generator,
+    ) -> Self:
+        """So many draws given the fitted records, at the optimum of a model under its whitening."""
+        plant = model.plant
         own, pieces = parts(plant.samples, axis), axis_pieces(plant, optimum.residual, axis)
         regressors = [optimum.tangents[part.rows] for part in own]
         jacobian = np.concatenate([optimum.jacobian[part.rows] for part in own])
@@ -54,7 +81,7 @@ class ResidualNoise:
         alone = joint_noise(pieces, plant.table.layout.responses[axis], "", scales)
         known = plausible_in_residual(
             list(zip(pieces, regressors, strict=True)),
-            besides * state.whitening.weighed[axis].sd ** 2,
+            besides * whitening.weighed[axis].sd ** 2,
             scales,
             alone.posterior,
             alone.dependence,
@@ -67,7 +94,7 @@ class ResidualNoise:
         beyond = 2 * share**2 * rho**2 / (1 - rho**2)  # as `Law.correlated` over all lags, less 1
         heavier = np.sqrt(freedom / (freedom - 2))
         of_all = np.column_stack([heavier * white, heavier * correlated_sd, rho])
-        noise = state.whitening.products_under(of_all, state.whitening.adjoint(optimum.jacobian.T), axis)
+        noise = whitening.products_under(of_all, whitening.adjoint(optimum.jacobian.T), axis)
         return cls(
             np.hypot(white, correlated_sd),
             single_correlation(beyond),
@@ -75,6 +102,11 @@ class ResidualNoise:
             _widening(optimum, np.concatenate(regressors), noise + besides),
             scales.period,
         )
+
+    @property
+    def scales(self) -> BandScales:
+        """Those of bands that hold it."""
+        return BandScales(_pooled(self.sd, self.freedom), _pooled(self.widening, np.inf))
 
     def draw(self, times: Vector, rng: np.random.Generator) -> Matrix:
         """Noise of each draw at times [time unit], (draws, n) [response unit]."""
@@ -93,6 +125,17 @@ def _widening(optimum: Optimum, tangents: Matrix, slopes: Array) -> Vector:
     onto = optimum.covariance @ (tangents.T @ tangents) @ optimum.covariance
     variance = np.einsum("kl,dlk->d", onto, slopes) / np.trace(onto @ optimum.information)
     return np.asarray(np.sqrt(variance))
+
+
+def _pooled(scales: Vector, freedom: Vector | float) -> float:
+    """Standard deviation of the normal whose central 90 % interval is that of all these laws of Student's
+    together, normal ones at infinite degrees of freedom."""
+
+    def beyond(half_width: float) -> float:
+        return float(2 * np.mean(student.cdf(half_width / scales, freedom)) - 1 - LEVEL)
+
+    ends = scales * student.isf((1 - LEVEL) / 2, freedom)
+    return float(brentq(beyond, 0.99 * ends.min(), 1.01 * ends.max())) / HALF_WIDTH
 
 
 def _innovations(law: Law, pieces: Sequence[Observed]) -> Vector:

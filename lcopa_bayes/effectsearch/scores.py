@@ -4,20 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import HALF_WIDTH, attributes
+from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Optimum
+from lcopa_bayes.effectsearch.residualnoise import BandScales, ResidualNoise
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.sampling.draws import Draws
+
+_DRAWS = 400
+"""Draws of the noise that a residual leaves plausible, and of a posterior behind bands [-]."""
+_SAMPLES = 64
+"""Samples of each of the latter [-]."""
+_SEED = 9
 
 
 @final
@@ -46,10 +54,13 @@ class Score:
     """What effects that differ from record to record add in these draws, (draws, n) [response unit]; None
     without any."""
 
+    scales: BandScales | None = None
+    """Those of its bands; None where noise of `noise_sd` is known."""
+
     @property
     def half_width(self) -> Vector:
         """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
-        return np.asarray(HALF_WIDTH * np.sqrt(self.variance + self.noise_sd**2))
+        return (self.scales or BandScales(self.noise_sd)).half_width(self.variance)
 
     @property
     def rmse(self) -> float:
@@ -98,6 +109,26 @@ class State:
     spread: Matrix | None = None
     """Covariance of the coordinates in these draws, or with internal constants of effects free, (k, k); None
     where that of the optimum is all."""
+
+    @cached_property
+    def residual_noise(self) -> tuple[ResidualNoise, ...]:
+        """What its residual leaves plausible of the noise of each axis."""
+        return tuple(
+            ResidualNoise.of(
+                self.model, self.optimum, self.whitening, axis, _DRAWS, np.random.default_rng([_SEED, axis])
+            )
+            for axis in range(len(self.whitening.noise))
+        )
+
+    @cached_property
+    def band_scales(self) -> tuple[BandScales | None, ...]:
+        """Those of the bands of each axis; None where the noise is known, or the bands hold what remains."""
+        none = (None,) * len(self.whitening.noise)
+        if self.widening is not None:
+            return none
+        if self.sampled is not None:
+            return tuple(_sampled_scales(*self.sampled, axis) for axis in range(len(none)))
+        return tuple(one.scales for one in self.residual_noise) if self.whitening.dependence else none
 
     @property
     def covariance(self) -> Matrix:
@@ -170,7 +201,16 @@ def score_of(
         variance,
         state.whitening.noise[axis].sd,
         level_from,
+        scales=state.band_scales[axis],
     )
+
+
+def _sampled_scales(draws: Draws, noise: Noise, axis: int) -> BandScales:
+    """Scales of bands that hold the noise of draws: many samples of each, far apart."""
+    values = draws.thinned(_DRAWS)
+    parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+    drawn = noise.draw(parameters, np.full(_SAMPLES, np.inf), np.random.default_rng([_SEED, axis]))
+    return BandScales(float(np.quantile(np.abs(drawn), LEVEL)) / HALF_WIDTH)
 
 
 def level_of(record: Samples, axis: int, misfit: Vector, noise: Law) -> tuple[float, float, str]:

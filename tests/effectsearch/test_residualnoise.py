@@ -1,5 +1,7 @@
 """Noise as the residual of a fit knows it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -8,9 +10,10 @@ from test_loop_unseen import SD, campaign, fitted
 
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
+from lcopa_bayes.effectsearch.heldoutscores import _about_optimum
 from lcopa_bayes.effectsearch.noise import joint_noise
-from lcopa_bayes.effectsearch.noiselaw import plausible, plausible_in_residual
-from lcopa_bayes.effectsearch.residualnoise import ResidualNoise, _tails
+from lcopa_bayes.effectsearch.noiselaw import Law, plausible, plausible_in_residual
+from lcopa_bayes.effectsearch.residualnoise import BandScales, ResidualNoise, _tails
 from lcopa_bayes.inference.noise import AR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise
 
@@ -107,7 +110,7 @@ def test_what_a_fit_leaves_open_is_that_of_dense_algebra(kind):
     """Estimates weigh their samples alike; their covariance under a law is the sandwich of White (1982)."""
     study = campaign(kind, 1)
     _, state = fitted(study)
-    found = ResidualNoise.of(state, 0, 5, np.random.default_rng(1))
+    found = ResidualNoise.of(state.model, state.optimum, state.whitening, 0, 5, np.random.default_rng(1))
     tangents, optimum = state.optimum.tangents, state.optimum
     n, sd = len(tangents), state.whitening.weighed[0].sd
     pieces, given = axis_pieces(state.model.plant, optimum.residual, 0), fitted_scales(state.model.plant)
@@ -140,3 +143,31 @@ def test_draws_have_the_scale_the_memory_and_the_tails_of_each():
     assert correlation[0, 2] == pytest.approx(0.8**4, abs=0.05)
     heavy = ResidualNoise(SD * many, 0.0 * many, 3.0 * many, many, 0.5).draw(np.arange(3.0), rng)
     assert stats.kstest(heavy.ravel() / SD, "t", args=(3,)).pvalue > 0.01
+
+
+@pytest.mark.parametrize("freedom", [3.0, 1e6])
+def test_bands_hold_nine_tenths_of_what_is_plausible(freedom):
+    """Noise and prediction of unequal laws, apart exactly, and together nearly."""
+    rng, many = np.random.default_rng(6), np.ones(40)
+    sd, widening = SD * np.geomspace(0.5, 4.0, 40), np.geomspace(3.0, 1.0, 40)
+    scales = ResidualNoise(sd, 0.5 * many, freedom * many, widening, 0.5).scales
+    noise = sd[:, None] * rng.standard_t(freedom, (40, 5000))
+    shift = SD * widening[:, None] * rng.standard_normal((40, 5000))
+    alone, given, both = (
+        scales.half_width(np.array([0.0])),
+        BandScales(0.0, scales.prediction).half_width(np.array([SD**2])),
+        scales.half_width(np.array([SD**2])),
+    )
+    assert np.mean(np.abs(noise) < alone) == pytest.approx(0.9, abs=0.004)
+    assert np.mean(np.abs(shift) < given) == pytest.approx(0.9, abs=0.004)
+    assert np.mean(np.abs(noise + shift) < both) == pytest.approx(0.9, abs=0.02)
+
+
+def test_bands_of_draws_hold_their_own_noise():
+    """Draws under noise that is half as large again as that of the residual."""
+    _, state = fitted(campaign("white", 1))
+    louder = replace(state.whitening, noise=(Law(1.5 * state.whitening.noise[0].sd),), dependence=(1.0,))
+    sampled = _about_optimum(replace(state, whitening=louder), 1)
+    (scales,) = replace(state, sampled=sampled).band_scales
+    assert scales.noise == pytest.approx(1.5 * state.whitening.noise[0].sd, rel=0.02)
+    assert scales.prediction == 1.0
