@@ -143,6 +143,7 @@ def test_all_that_is_wrong_with_a_study_is_reported_at_once(tmp_path):
 
 
 SHORTER = {
+    "lb.audit(fit)": "lb.audit(fit, quick=True)",
     "bench_time=1000": "bench_time=20, quick=True",
     "fractional-2": "fractional-1",
     "second-order": "first-order",
@@ -194,7 +195,7 @@ def test_the_lines_that_must_work(tmp_path, monkeypatch):
     (predicted,) = (one for one in results.values() if isinstance(one, lb.Prediction))
     assert (predicted.table()["plant_pointwise_05"] <= predicted.table()["plant_pointwise_95"]).all()
     assert results["fit.frequency_response([0.01, 0.1])"].table().shape[0] == 2
-    verdicts = results["lb.audit(fit).summary()"]
+    verdicts = results["lb.audit(fit, quick=True).summary()"]
     assert set(verdicts["parameter"]) == {"gain", "time_1", "sigma"}
     tables = [one for source, one in results.items() if source.startswith("lb.compare")]
     assert [list(one["name"]) for one in tables] == [
@@ -225,11 +226,11 @@ def test_an_audit_of_a_fit_a_folder_and_a_study_are_one(fit, folder, audit):
     assert lb.audit(small(), quick=True).to_json() == audit.to_json()
 
 
-def test_candidates_by_name_and_studies_side_by_side(comparison):
+def test_candidates_by_name_and_studies_side_by_side(fit, comparison):
     assert list(comparison.summary()["name"]) == ["study", "first-order"]
     pair = lb.compare(
         [
-            small(),
+            fit,
             lb.Study(
                 "whole",
                 fit=[ON],

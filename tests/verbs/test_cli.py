@@ -20,6 +20,8 @@ from lcopa_bayes.report.page import tied
 DEVICE = Device(
     ((TransferPath(2.0, 0.5, (1.5,), (1.2,), 1.0),),), (Axis("in", "V"),), (Axis("out", "mm"),), (0.3,)
 )
+STATED = "[model]\nterms = 1\n"
+"""The structure, which then is not chosen."""
 
 
 @pytest.fixture
@@ -54,7 +56,9 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
 @pytest.mark.usefixtures("undrawn")
 def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, capsys):
     out = tmp_path / "run"
-    code, printed, _ = run(capsys, "fit", study(record), "--out", out, "--json", "--quiet", "--jobs", 1)
+    code, printed, _ = run(
+        capsys, "fit", study(record, STATED), "--out", out, "--json", "--quiet", "--jobs", 1
+    )
     reported = json.loads(printed)
     assert code == 0
     names = {p["name"] for p in reported["parameters"]}
