@@ -19,6 +19,7 @@ from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.heldouteffects import unseen_share
+from lcopa_bayes.effectsearch.heldoutscores import _about_optimum
 from lcopa_bayes.effectsearch.leavingout import log_scores
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
@@ -596,7 +597,8 @@ def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypat
     def around(model, _):
         return np.random.default_rng(0).normal(size=(50, len(model.names)))
 
-    monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: ("draws", None))
+    drawn = _about_optimum(clean.after.state, 1)
+    monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: drawn)
     monkeypatch.setattr(findings, "coordinates_of", around)
     monkeypatch.setattr(findings, "unseen_scores", away)
     found = loop(study(1), library=LIBRARY, quick=True, as_stated=True)
