@@ -26,6 +26,7 @@ _DRAWS = 400
 _SAMPLES = 64
 """Samples of each of the latter [-]."""
 _SEED = 9
+"""Mark of their randomness."""
 
 
 @final
@@ -53,7 +54,6 @@ class Score:
     varied: Matrix | None = None
     """What effects that differ from record to record add in these draws, (draws, n) [response unit]; None
     without any."""
-
     scales: BandScales | None = None
     """Those of its bands; None where noise of `noise_sd` is known."""
 
