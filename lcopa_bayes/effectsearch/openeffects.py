@@ -23,7 +23,7 @@ from scipy.stats import truncnorm
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
-from lcopa_bayes.effectsearch.drawsabout import beside_constants, likely_draws
+from lcopa_bayes.effectsearch.drawsabout import draws_about
 from lcopa_bayes.effectsearch.freedconstants import loosened
 from lcopa_bayes.effectsearch.refits import log_bayes_factor, places, without
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
@@ -122,7 +122,7 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
-        own = beside_constants(state, likely_draws(state, rng, _FOLLOWING), rng)
+        own = draws_about(state, rng, _FOLLOWING)
     parts, weights = [own], [1.0]
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)

@@ -10,7 +10,7 @@ from typing import Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.effectsearch.drawsabout import likely_draws
+from lcopa_bayes.effectsearch.drawsabout import draws_about
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.openeffects import step_figures
 from lcopa_bayes.effectsearch.regression import Optimum
@@ -43,7 +43,7 @@ class OtherPlant:
     @cached_property
     def draws(self) -> Matrix:
         """Draws about its optimum that follow the records, (draws, coordinates)."""
-        return likely_draws(self.state, np.random.default_rng(_SEED), _DRAWS)
+        return draws_about(self.state, np.random.default_rng(_SEED), _DRAWS)
 
     def figures(self, *, span: float, time_unit: str) -> dict[str, Vector]:
         """Those of its response to a unit step over `span` [time unit], by name."""

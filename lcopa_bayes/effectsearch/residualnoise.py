@@ -60,6 +60,8 @@ class ResidualNoise:
     weighs its samples, (draws,) [-]."""
     period: float
     """Sampling period [time unit]."""
+    slopes: Array
+    """Covariance of the slope of the cost under it, (draws, coordinates, coordinates)."""
 
     @classmethod
     def of(
@@ -101,6 +103,7 @@ class ResidualNoise:
             freedom,
             _widening(optimum, np.concatenate(regressors), noise + besides),
             scales.period,
+            noise,
         )
 
     @property

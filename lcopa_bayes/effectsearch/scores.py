@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -129,6 +129,22 @@ class State:
         if self.sampled is not None:
             return tuple(_sampled_scales(*self.sampled, axis) for axis in range(len(none)))
         return tuple(one.scales for one in self.residual_noise) if self.whitening.dependence else none
+
+    @cached_property
+    def stretches(self) -> Array | None:
+        """What turns deviations of the coordinates from the optimum into those under noise that the residual
+        leaves plausible, (draws, k, k) [-]; None where the noise is known, or that of what remains.
+
+        Their covariance is the sandwich of White (1982, Econometrica 50).
+        """
+        if not self.whitening.dependence or self.widening is not None:
+            return None
+        at, root = self.optimum, np.linalg.cholesky(self.optimum.covariance)
+        priors = at.information - at.jacobian.T @ at.jacobian
+        slopes = priors + sum(one.slopes for one in self.residual_noise)
+        power, axes = np.linalg.eigh(root.T @ slopes @ root)
+        whitened = (axes * np.sqrt(np.maximum(power, 0.0))[:, None]) @ axes.swapaxes(1, 2)
+        return np.asarray(root @ whitened @ np.linalg.inv(root))
 
     @property
     def covariance(self) -> Matrix:

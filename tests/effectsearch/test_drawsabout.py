@@ -10,13 +10,20 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from test_loop_unseen import campaign, fitted
 
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.drawsabout import _scales, beside_constants, likely_draws
+from lcopa_bayes.effectsearch.drawsabout import (
+    _scales,
+    beside_constants,
+    draws_about,
+    likely_draws,
+    under_plausible_noise,
+)
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.model.path import TransferPath
@@ -90,9 +97,33 @@ def test_a_scale_is_never_wider_than_the_normal_one(falls: Callable[[np.ndarray]
     np.testing.assert_array_equal(_scales(lambda step, _: falls(step), np.array([1.0, 0.2])), [1.0, 0.2])
 
 
-def test_a_scale_ends_inside_the_support() -> None:
-    (scale,) = _scales(lambda step, _: np.where(step > 0.03, np.inf, 0.5 * step**2), np.ones(1))
-    assert 0.01 < scale <= 0.03
+@pytest.mark.parametrize(("width", "end", "expected"), [(1.0, 0.03, 1.0), (0.1, 0.15, 0.1), (0.1, 0.0, 0.5)])
+def test_a_scale_is_read_inside_the_support(width: float, end: float, expected: float) -> None:
+    """However near its end is, since draws beyond it are not taken; where all is beyond, the normal one."""
+    (scale,) = _scales(
+        lambda step, _: np.where(step > end, np.inf, 0.5 * (step / width) ** 2),
+        np.full(1, max(expected, 0.5)),
+    )
+    assert scale == pytest.approx(expected)
+
+
+def test_near_an_end_of_the_support_they_are_normal_ones_inside_it() -> None:
+    """A delay at its least value, by an optimum that a steep slope does not hold there: of the normal draws
+    those inside, not all of them nearer to the optimum."""
+    study = campaign("coloured", 0)
+    _, state = fitted(study)
+    x, sd = state.optimum.x, np.sqrt(np.diag(state.covariance))
+    low, high = state.model.bounds
+    assert not state.optimum.stuck.any()
+    assert x[3] - low[3] < 1e-3 * sd[3]
+    normal = np.random.default_rng(5).multivariate_normal(x, state.covariance, 20 * COUNT)
+    inside = normal[((normal >= low) & (normal <= high)).all(axis=1)]
+    slope = (state.optimum.jacobian.T @ state.optimum.white)[3]
+    weights = np.exp(-np.abs(slope) * (inside[:, 3] - low[3]))  # by the slope at the end
+    drawn = likely_draws(state, np.random.default_rng(1), COUNT)
+    mean = weights @ inside / weights.sum()
+    expected = np.sqrt(weights @ (inside - mean) ** 2 / weights.sum())
+    np.testing.assert_allclose(drawn.std(axis=0) / expected, 1.0, atol=0.25)
 
 
 def test_an_axis_without_width_has_none() -> None:
@@ -121,3 +152,34 @@ def test_what_constants_leave_open_is_added() -> None:
     power = np.var(drawn, axis=0) / sd**2
     assert power[0] == pytest.approx(4.0, rel=0.2)
     assert power[1:] == pytest.approx(1.0, rel=0.2)
+
+
+def test_deviations_are_stretched_each_by_one_of_those_that_are_plausible() -> None:
+    """And stay as they are where that leads out of the support, or where the noise is known."""
+    state = at_optimum(1)
+    drawn = likely_draws(state, np.random.default_rng(1), 200)
+    assert state.stretches is None
+    np.testing.assert_array_equal(under_plausible_noise(state, drawn, np.random.default_rng(2)), drawn)
+    own, x = replace(state), state.optimum.x
+    vars(own)["stretches"] = np.array([2.0, 3.0])[:, None, None] * np.eye(x.size)
+    moved = under_plausible_noise(own, drawn, np.random.default_rng(2))
+    factor = np.round(((moved - x) / np.where(drawn == x, np.nan, drawn - x))[1:], 9)
+    assert set(factor[:, 0]) == {2.0, 3.0}
+    assert (factor == factor[:, :1]).all()
+    vars(own)["stretches"] = np.full((1, x.size, x.size), 1e9)
+    np.testing.assert_array_equal(under_plausible_noise(own, drawn, np.random.default_rng(2))[1:], drawn[1:])
+
+
+def test_draws_hold_the_truth_where_the_residual_alone_tells_the_noise() -> None:
+    """Gain and lag of clean campaigns of noise of correlation 0.9 and no sample at rest; the delay is 0."""
+    levels = []
+    for seed in range(12):
+        _, state = fitted(campaign("coloured", seed))
+        columns = [state.model.names.index(name) for name in ("gain", "time_1")]
+        rows = [state.model.posterior.table.rows[state.model.columns[k]] for k in columns]
+        truth = [row.coordinate(value) for row, value in zip(rows, (2.0, 8.0), strict=True)]
+        drawn = draws_about(state, np.random.default_rng(1), 200)[:, columns]
+        levels.append(np.mean(drawn < truth, axis=0))
+    off = np.abs(np.array(levels) - 0.5)
+    assert np.mean(off < 0.45) > 0.75  # 0.58 by draws under the residual's own noise that shrink at the end
+    assert 0.35 < np.mean(off < 0.25) < 0.75

@@ -17,6 +17,7 @@ from lcopa_bayes.effectsearch.residualnoise import BandScales, ResidualNoise, _t
 from lcopa_bayes.inference.noise import AR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise
 
+NO_SLOPES = np.empty((0, 0, 0))
 SHAPES = np.array([[1.0, 0.0, 0.5], [0.6, 0.8, 0.7], [0.0, 1.0, 0.9], [0.0, 1.0, 0.98]])
 
 
@@ -123,25 +124,30 @@ def test_what_a_fit_leaves_open_is_that_of_dense_algebra(kind):
     apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     gain = np.linalg.solve(optimum.information, tangents.T / sd**2)
     prior = np.linalg.solve(optimum.information, np.linalg.solve(optimum.information, besides).T)
-    wide = np.trace(tangents @ np.linalg.solve(optimum.information, tangents.T))
-    for law, size, freedom, widening in zip(laws, found.sd, found.freedom, found.widening, strict=True):
+    inverse = np.linalg.inv(optimum.information)
+    wide = np.trace(tangents @ inverse @ tangents.T)
+    vars(state)["residual_noise"] = (found,)
+    pairs = zip(laws, found.sd, found.freedom, found.widening, state.stretches, strict=True)
+    for law, size, freedom, widening, stretch in pairs:
         larger = size**2 / (law[0] ** 2 + law[1] ** 2) * freedom / (freedom - 2)
         noise = larger * (law[0] ** 2 * np.eye(n) + law[1] ** 2 * law[2] ** apart)
         spread = gain @ noise @ gain.T + prior
         assert widening**2 == pytest.approx(np.trace(tangents @ spread @ tangents.T) / wide, rel=1e-6)
+        sd = np.sqrt(np.diag(spread))
+        np.testing.assert_allclose(stretch @ inverse @ stretch.T, spread, atol=1e-6 * np.outer(sd, sd).max())
 
 
 def test_draws_have_the_scale_the_memory_and_the_tails_of_each():
     """4000 records of equally and unequally spaced samples."""
     rng = np.random.default_rng(2)
     many = np.ones(4000)
-    noise = ResidualNoise(SD * many, 0.8 * many, 1e6 * many, many, 0.5)
+    noise = ResidualNoise(SD * many, 0.8 * many, 1e6 * many, many, 0.5, NO_SLOPES)
     drawn = noise.draw(np.array([0.0, 0.5, 2.0]), rng)
     np.testing.assert_allclose(drawn.std(axis=0), SD, rtol=0.05)
     correlation = np.corrcoef(drawn.T)
     assert correlation[0, 1] == pytest.approx(0.8, abs=0.03)
     assert correlation[0, 2] == pytest.approx(0.8**4, abs=0.05)
-    heavy = ResidualNoise(SD * many, 0.0 * many, 3.0 * many, many, 0.5).draw(np.arange(3.0), rng)
+    heavy = ResidualNoise(SD * many, 0.0 * many, 3.0 * many, many, 0.5, NO_SLOPES).draw(np.arange(3.0), rng)
     assert stats.kstest(heavy.ravel() / SD, "t", args=(3,)).pvalue > 0.01
 
 
@@ -150,7 +156,7 @@ def test_bands_hold_nine_tenths_of_what_is_plausible(freedom):
     """Noise and prediction of unequal laws, apart exactly, and together nearly."""
     rng, many = np.random.default_rng(6), np.ones(40)
     sd, widening = SD * np.geomspace(0.5, 4.0, 40), np.geomspace(3.0, 1.0, 40)
-    scales = ResidualNoise(sd, 0.5 * many, freedom * many, widening, 0.5).scales
+    scales = ResidualNoise(sd, 0.5 * many, freedom * many, widening, 0.5, NO_SLOPES).scales
     noise = sd[:, None] * rng.standard_t(freedom, (40, 5000))
     shift = SD * widening[:, None] * rng.standard_normal((40, 5000))
     alone, given, both = (
