@@ -10,6 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -139,12 +140,14 @@ class State:
         """
         if not self.whitening.dependence or self.widening is not None:
             return None
-        at, root = self.optimum, np.linalg.cholesky(self.optimum.covariance)
+        at, sd = self.optimum, self.optimum.sd
+        unit = np.where(sd > 0.0, sd, 1.0)  # no result depends on the units
+        root = root_of(at.covariance / np.outer(unit, unit))
         priors = at.information - at.jacobian.T @ at.jacobian
         slopes = priors + sum(one.slopes for one in self.residual_noise)
-        power, axes = np.linalg.eigh(root.T @ slopes @ root)
+        power, axes = np.linalg.eigh(root.T @ (slopes * np.outer(unit, unit)) @ root)
         whitened = (axes * np.sqrt(np.maximum(power, 0.0))[:, None]) @ axes.swapaxes(1, 2)
-        return np.asarray(root @ whitened @ np.linalg.inv(root))
+        return np.asarray(unit[:, None] * (root @ whitened @ np.linalg.pinv(root)) / unit)
 
     @property
     def covariance(self) -> Matrix:

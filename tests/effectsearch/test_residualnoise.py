@@ -137,6 +137,25 @@ def test_what_a_fit_leaves_open_is_that_of_dense_algebra(kind):
         np.testing.assert_allclose(stretch @ inverse @ stretch.T, spread, atol=1e-6 * np.outer(sd, sd).max())
 
 
+@pytest.mark.parametrize("unit", [1e-9, 0.0, 1e12])
+def test_what_noise_leaves_open_depends_on_no_unit(unit):
+    """That of the gain is another, or nothing is known of it, so that its draws stay where they are."""
+    _, state = fitted(campaign("coloured", 1))
+    (noise,), to = state.residual_noise, np.diag([unit, *np.ones(state.optimum.x.size - 1)])
+    optimum = replace(
+        state.optimum,
+        information=to @ state.optimum.information @ to,
+        jacobian=state.optimum.jacobian @ to,
+    )
+    other = replace(state, optimum=optimum)
+    vars(other)["residual_noise"] = (replace(noise, slopes=to @ noise.slopes @ to),)
+    if unit:
+        np.testing.assert_allclose(to @ other.stretches @ np.linalg.inv(to), state.stretches, atol=1e-5)
+    else:
+        np.testing.assert_array_equal(other.stretches[:, 0], 0.0)
+        assert np.isfinite(other.stretches).all()
+
+
 def test_draws_have_the_scale_the_memory_and_the_tails_of_each():
     """4000 records of equally and unequally spaced samples."""
     rng = np.random.default_rng(2)
