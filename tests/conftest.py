@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from lcopa_bayes.cli import keep_one_thread
+from lcopa_bayes.core.parallel import cores
 
 
 def pytest_configure() -> None:
@@ -16,6 +18,12 @@ def pytest_configure() -> None:
     keep_one_thread()
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: a test that waits for a process or a disk leaves its core idle."""
+    return cores() + 1
 
 
 @pytest.fixture
@@ -28,6 +36,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Empty figures, for what a page says in words."""
     empty = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"></svg>'
     monkeypatch.setattr("lcopa_bayes.report.svg.svg_of", lambda figure: empty)
+    # half the time of the figures of a fit goes into the axes of this one
+    monkeypatch.setattr("lcopa_bayes.report.draws.corner_figure", lambda run, names: Figure())
 
 
 @pytest.fixture(scope="module")

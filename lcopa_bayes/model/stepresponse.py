@@ -39,6 +39,10 @@ _POWER = 2.5
 """Blocks of the finest level below which the response is taken as its leading power of time."""
 SIDE = 2
 """Blocks on either side of the one that is read."""
+_AROUND = np.arange(-SIDE, SIDE + 1)
+"""The blocks that are read, from the one that holds a position."""
+_NARROWER = NEAR / float(_RATIO) ** np.arange(1, _LEVELS)
+"""Positions up to which the second and each further level of narrower blocks is read [blocks]."""
 
 
 def _tap_polynomials() -> Matrix:
@@ -49,7 +53,7 @@ def _tap_polynomials() -> Matrix:
     """
     edges = np.arange(-SIDE, SIDE + 2, dtype=float)
     rows = []
-    for block in range(-SIDE, SIDE + 1):
+    for block in _AROUND:
         area = np.where(edges > block, 1.0, 0.0) - (1.0 if block < 0 else 0.0)
         rows.append(np.linalg.solve(np.vander(edges, increasing=True), area))
     return np.array(rows)
@@ -115,7 +119,7 @@ class StepResponse:
         out = np.zeros((self.coarse.shape[0], *theta.shape, n))
         inner = out[..., SIDE:]
         around = sliding_window_view(self.coarse[:, None], 2 * SIDE + 1, axis=3)
-        weights = np.moveaxis(taps(theta, kind), 0, -1)[..., None]
+        weights = taps(theta, kind).transpose(1, 2, 0)[..., None]
         np.matmul(around, weights, out=inner[..., None])
         if kind == "integral":
             inner += self._sums[:, None, :, SIDE:n]
@@ -139,7 +143,7 @@ class StepResponse:
         block = np.clip(np.floor(x).astype(int), SIDE, n - SIDE - 1)
         weights = taps(x - block, kind)
         flat, place = self.coarse.reshape(len(out), -1), block + n * np.arange(len(x))[:, None]
-        for weight, shift in zip(weights, range(-SIDE, SIDE + 1), strict=True):
+        for weight, shift in zip(weights, _AROUND, strict=True):
             inner += weight * flat.take(place + shift, axis=1)
         if kind == "integral":
             inner += self._sums.reshape(len(out), -1).take(place, axis=1)
@@ -177,17 +181,14 @@ class StepResponse:
 
     def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
         """Readings of single elements at positions below NEAR, (rows, positions)."""
-        level = np.clip(np.floor(np.log(NEAR / np.maximum(x, 1e-9)) / np.log(_RATIO)), 0, _LEVELS - 1)
-        level = level.astype(int)
+        level = (x[:, None] <= _NARROWER).sum(axis=1)
         width = _RATIO ** -(level + 1.0)
         position = x / width
         power = position < _POWER
         place = np.where(power, _POWER, position)
         block = np.minimum(np.floor(place).astype(int), _FINE - SIDE - 1)
-        around = sliding_window_view(self.fine, 2 * SIDE + 1, axis=3)[:, level, element, block - SIDE]
-        values = np.asarray(
-            np.matmul(around[:, :, None], taps(place - block, kind).T[:, :, None])[:, :, 0, 0]
-        )
+        around = self.fine[:, level[:, None], element[:, None], block[:, None] + _AROUND]
+        values = np.asarray(np.einsum("rpl,lp->rp", around, taps(place - block, kind)))
         if kind == "integral":
             values = (values + self._fine_sums[:, level, element, block]) * width
         elif kind == "slope":
@@ -256,7 +257,7 @@ def _hand_over(narrow: Array, wide: Array) -> None:
     """Replace the first block means by those of the narrower blocks in them."""
     count = min(NEAR, wide.shape[-1])
     parts = narrow[..., : _RATIO * count].reshape(*narrow.shape[:-1], count, _RATIO)
-    wide[..., :count] = parts.mean(axis=-1)
+    np.divide(parts.sum(axis=-1), _RATIO, out=wide[..., :count])
 
 
 def _means(times: Array, integrals: Integrals, circle: Circle, slopes: Slopes) -> Array:

@@ -184,9 +184,11 @@ class _Read:
 
         Parameters: start (batch,); slots increasing from 0, the last of them length - 1.
         """
-        first = np.clip(start + self.size, 0, self.padded.shape[2] - length)
+        last = self.padded.shape[2] - length
         if start.size == 1:
-            return self.padded[:, :, first[0] : first[0] + length][:, :, slots]
+            begin = min(max(int(start[0]) + self.size, 0), last)
+            return self.padded[:, :, begin : begin + length][:, :, slots]
+        first = np.clip(start + self.size, 0, last)
         windows = sliding_window_view(self.padded, length, axis=2)
         return np.asarray(windows[:, np.arange(start.size), first][:, :, slots])
 
