@@ -19,8 +19,9 @@ _COMPONENTS = 20
 """Most components of a mixture."""
 _FITTED = 6_000
 """Most points a mixture is fitted to."""
-FREEDOM = 5.0
-"""Degrees of freedom of the components: tails heavy enough to cover what the fit does not include [-]."""
+FREEDOM = 5
+"""Degrees of freedom of the components, a whole number: tails heavy enough to cover what the fit does not
+include [-]."""
 _ROUNDS, _GAIN = 60, 1e-3
 """Most rounds of expectation maximisation, and gain per point below which they end [nat]: a good cover is
 wanted, not the maximum."""
@@ -101,13 +102,38 @@ class Mixture:
 
     def log_density(self, points: Matrix) -> Vector:
         """Log density, (n,)."""
-        return np.asarray(np.logaddexp.reduce(self.log_parts(points), axis=0))
+        parts, level = self._parts(self.distances(points))
+        return np.asarray(np.log(parts.sum(axis=0)) + level)
 
-    def log_parts(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
-        """Log density of each component times its weight, (components, n), from `distances` where given."""
-        if distances is None:
-            distances = self.distances(points)
-        parts = np.log1p(distances / FREEDOM)
+    def shares(self, distances: Matrix) -> Matrix:
+        """Probability of each component given points at these `distances`, (components, n) [-]."""
+        parts, _ = self._parts(distances)
+        parts /= parts.sum(axis=0)
+        return parts
+
+    def _parts(self, distances: Matrix) -> tuple[Matrix, Vector]:
+        """Density of each component times its weight, (components, n), over a level whose logarithm is (n,).
+
+        That level is of the component that is nearest, so that no sum underflows. By products: logarithms and
+        powers of every entry would take longer than the distances.
+        """
+        here = distances if self.weights.all() else distances[self.weights > 0.0]
+        nearest = here.min(axis=0)
+        exponent, highest = FREEDOM + self.dimension, self._levels.max()
+        ratio = (FREEDOM + nearest) / (FREEDOM + distances)
+        parts = np.sqrt(ratio) if exponent % 2 else np.ones_like(ratio)
+        remaining = exponent // 2
+        while remaining:
+            if remaining % 2:
+                parts *= ratio
+            ratio *= ratio
+            remaining //= 2
+        parts *= np.exp(self._levels - highest)[:, None]
+        return parts, highest - 0.5 * exponent * np.log1p(nearest / FREEDOM)
+
+    def log_parts(self, points: Matrix) -> Matrix:
+        """Log density of each component times its weight, (components, n)."""
+        parts = np.log1p(self.distances(points) / FREEDOM)
         parts *= -0.5 * (FREEDOM + self.dimension)
         parts += self._levels[:, None]
         return parts
@@ -133,10 +159,9 @@ class Mixture:
             np.einsum("nkd,nkd->kn", white, white, out=out[:, some])
         return out
 
-    def log_shares(self, points: Matrix, distances: Matrix | None = None) -> Matrix:
-        """Log probability of each component given a point, (components, n); `distances` where these are
-        known."""
-        parts = self.log_parts(points, distances)
+    def log_shares(self, points: Matrix) -> Matrix:
+        """Log probability of each component given a point, (components, n)."""
+        parts = self.log_parts(points)
         return np.asarray(parts - np.logaddexp.reduce(parts, axis=0))
 
     @cached_property

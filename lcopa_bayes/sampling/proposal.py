@@ -376,7 +376,7 @@ class _Cloud:
         size = self.y.shape[1]
         for _ in range(steps):
             distances = core.distances(self.y)
-            own = np.exp(core.log_shares(self.y, distances)) * self.weights
+            own = core.shares(distances) * self.weights
             mass = own.sum(axis=1)
             kept = mass >= _NO_MASS
             own, mass = own[kept], mass[kept]

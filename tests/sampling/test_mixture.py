@@ -160,6 +160,23 @@ def test_a_component_without_weight_has_no_share(three, rng):
     points = without.draw(100, np.random.RandomState(np.random.MT19937(5)))
     assert_array_equal(without.log_shares(points)[1], 0.0)
     assert (without.log_shares(points)[[0, 2]] == -np.inf).all()
+    assert_array_equal(
+        without.shares(without.distances(points)), np.array([[0.0], [1.0], [0.0]]) * np.ones(100)
+    )
+    assert_allclose(without.log_density(points), without.log_parts(points)[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("dimension", range(1, 8))
+@pytest.mark.parametrize("far", [1.0, 1e9, 1e60])
+def test_products_give_what_logarithms_give(dimension, far, rng):
+    """Also where others are less than any number: at the mean of a component of hardly any weight."""
+    factors = np.tile(0.5 * np.eye(dimension), (4, 1, 1))
+    means = far * rng.normal(size=(4, dimension))
+    mixture = Mixture(np.array([0.7, 0.2, 0.1 - 1e-290, 1e-290]), means, factors)
+    points = np.concatenate([means, far * rng.normal(scale=10.0, size=(40, dimension))])
+    assert_allclose(mixture.log_density(points), logsumexp(mixture.log_parts(points), axis=0), rtol=1e-12)
+    shares = mixture.shares(mixture.distances(points))
+    assert_allclose(shares, np.exp(mixture.log_shares(points)), rtol=1e-9, atol=1e-60)
 
 
 def test_points_are_spread_evenly():
