@@ -178,12 +178,18 @@ class ExtendedModel:
         out[np.searchsorted(self.columns, source[self.columns])] = x
         return out
 
+    def plants(self, x: Matrix) -> Matrix:
+        """Table values of the plant alone at coordinates (batch, k), (batch, rows), in canonical order."""
+        table = self.plant.table
+        values = np.tile(self.template[: len(table.rows)], (len(x), 1))
+        for position, k in enumerate(self.columns[: self.plant_size]):
+            values[:, k] = table.rows[k].value_at(x[:, position])
+        return table.canonical(values)
+
     def supported(self, x: Matrix) -> Flags:
         """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,); terms that can
         be exchanged may be in any sequence."""
-        values = np.array([self._least.values(each, self.template) for each in x])
-        values, table = values.reshape(len(x), self.template.size), self.posterior.table
-        return table.supported(table.canonical(values))
+        return self.plant.table.supported(self.plants(x))
 
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""

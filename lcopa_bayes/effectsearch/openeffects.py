@@ -175,16 +175,12 @@ def step_figures(
     """Figures of the plant's response to a unit step over `span` [time unit], its effects aside, over the
     draws of a `mixture`; none where no draw of the final model is a plant."""
     model = state.model
-    table, columns = model.plant.table, model.columns[: model.plant_size]
+    table = model.plant.table
     kept: list[Matrix] = []
     shares: list[float] = []
     for part, weight in zip(parts, weights, strict=True):
         count = min(max(round(_RESPONSES * weight), _FEWEST), len(part))
-        drawn = part[np.linspace(0, len(part) - 1, count).astype(int)]
-        values = np.tile(model.template[: len(table.rows)], (count, 1))
-        for position, k in enumerate(columns):
-            values[:, k] = table.rows[k].value_at(drawn[:, position])
-        values = table.canonical(values)
+        values = model.plants(part[np.linspace(0, len(part) - 1, count).astype(int)])
         values = values[table.supported(values)]
         if not len(values) and not kept:
             return ()
