@@ -19,7 +19,7 @@ from typing import Literal, final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.powerseries import Integrals, transfer, transfer_slopes
 
@@ -41,8 +41,10 @@ SIDE = 2
 """Blocks on either side of the one that is read."""
 _AROUND = np.arange(-SIDE, SIDE + 1)
 """The blocks that are read, from the one that holds a position."""
-_NARROWER = NEAR / float(_RATIO) ** np.arange(1, _LEVELS)
-"""Positions up to which the second and each further level of narrower blocks is read [blocks]."""
+_WIDTHS = float(_RATIO) ** -np.arange(1, _LEVELS + 1)
+"""Of the blocks of each finer level [blocks]."""
+_NARROWER = NEAR * _WIDTHS[:-1]
+"""Positions up to which the second and each further level is read [blocks]."""
 
 
 def _tap_polynomials() -> Matrix:
@@ -181,22 +183,27 @@ class StepResponse:
 
     def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
         """Readings of single elements at positions below NEAR, (rows, positions)."""
-        level = (x[:, None] <= _NARROWER).sum(axis=1)
-        width = _RATIO ** -(level + 1.0)
+        level = np.zeros(x.size, dtype=int)
+        for limit in _NARROWER:
+            level += x <= limit
+        width = _WIDTHS[level]
         position = x / width
         power = position < _POWER
         place = np.where(power, _POWER, position)
         block = np.minimum(np.floor(place).astype(int), _FINE - SIDE - 1)
-        around = self.fine[:, level[:, None], element[:, None], block[:, None] + _AROUND]
+        batch = self.fine.shape[2]
+        middle = (level * batch + element) * _FINE + block
+        rows = len(self.fine)
+        around = self.fine.reshape(rows, -1).take(middle[:, None] + _AROUND, axis=1)
         values = np.asarray(np.einsum("rpl,lp->rp", around, taps(place - block, kind)))
         if kind == "integral":
-            values = (values + self._fine_sums[:, level, element, block]) * width
+            values = (values + self._fine_sums.reshape(rows, -1).take(middle, axis=1)) * width
         elif kind == "slope":
             values /= width
         self._lead(values, power, element, position, kind)
         return values
 
-    def _lead(self, values: Array, power: Array, element: Index, position: Vector, kind: Kind) -> None:
+    def _lead(self, values: Array, power: Flags, element: Index, position: Vector, kind: Kind) -> None:
         """Overwrite readings closest to the onset by the leading power of time; zero before the onset."""
         chosen = np.flatnonzero(power)
         if not chosen.size:
@@ -209,7 +216,7 @@ class StepResponse:
         means = self.fine[:, -1, element, block - SIDE : block + SIDE + 1]
         edge = np.einsum("rpl,l->rp", means, weights)
         order = self.orders[element]
-        width = float(_RATIO) ** -_LEVELS
+        width = _WIDTHS[-1]
         log, growth = np.log(base), base**order
         if kind == "integral":
             scale = growth * base * _POWER * width / (order + 1.0)
@@ -243,10 +250,9 @@ def step_response(
     Accuracy: as `transfer` corrected; see the module for the onset itself. What the blocks are too wide
     for, `transfer` says.
     """
-    scale = float(_RATIO) ** np.arange(1, _LEVELS + 1)
     integrals = Integrals(orders, max(circle.n, _FINE), in_orders=slopes == "all")  # blocks of any width
     coarse = _means(times / step, integrals, circle, slopes)
-    fine = _means(times / step * scale[:, None, None], integrals, _FINE_CIRCLE, slopes)
+    fine = _means(times / step / _WIDTHS[:, None, None], integrals, _FINE_CIRCLE, slopes)
     for level in range(_LEVELS - 2, -1, -1):
         _hand_over(fine[:, level + 1], fine[:, level])
     _hand_over(fine[:, 0], coarse)
