@@ -11,12 +11,12 @@ from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import partial
+from functools import partial, wraps
 from itertools import chain
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
 from threading import Thread
-from typing import Any, Generic, TypeVar, final
+from typing import Any, Generic, ParamSpec, TypeVar, final
 
 from threadpoolctl import threadpool_limits
 
@@ -26,6 +26,7 @@ from lcopa_bayes.core.packing import packed, unpacked
 
 S = TypeVar("S")
 T = TypeVar("T")
+P = ParamSpec("P")
 R = TypeVar("R")
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
 """Options of the allocator of the GNU C library with their values: arrays below 32 MB, the most it takes,
@@ -115,6 +116,21 @@ def on_cluster(address: str | None) -> Iterator[int]:
             yield max(2, cluster.size)
         finally:
             _CLUSTER.reset(token)
+
+
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """The function with one thread for the linear algebra of this process.
+
+    Matrices are small, and threads wait for each other: beside other work on the same cores half of the time
+    of a fit of 120 samples.
+    """
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
+        with threadpool_limits(1):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 @contextmanager

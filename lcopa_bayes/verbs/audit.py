@@ -8,6 +8,7 @@ from typing import final
 
 import pandas as pd
 
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.experiments.summary import next_measurement
 from lcopa_bayes.identifiability.audit import audit as audited
 from lcopa_bayes.results.stored import StoredResult, origin_of
@@ -41,6 +42,7 @@ class AuditResult(StoredResult):
         )
 
 
+@on_one_thread
 def audit(
     source: FitLike,
     *,

@@ -21,6 +21,7 @@ from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Qu
 from lcopa_bayes.calibration.truths import Stated, Truths
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import csv_of
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
@@ -266,6 +267,7 @@ class CalibrationResult(StoredResult):
         return pd.DataFrame(self.values["coverage"])
 
 
+@on_one_thread
 def calibrate(
     study: StudyLike | Predictive,
     *,

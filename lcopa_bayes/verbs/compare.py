@@ -16,6 +16,7 @@ from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
@@ -59,6 +60,7 @@ class Comparison(StoredResult):
         return pd.DataFrame(rows).assign(preferred=lambda table: table["name"] == self.preferred)
 
 
+@on_one_thread
 def compare(
     study: FitLike | Sequence[FitLike],
     candidates: Sequence[str] | None = None,

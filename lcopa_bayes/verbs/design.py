@@ -9,6 +9,7 @@ from typing import Any, final
 
 import pandas as pd
 
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.data.drive import Drive, drive_of
 from lcopa_bayes.data.record import columns_of
 from lcopa_bayes.experiments.candidates import template
@@ -69,6 +70,7 @@ class DesignResult(StoredResult):
         )
 
 
+@on_one_thread
 def design(
     source: FitLike,
     *,

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.core.parallel import meanwhile, on_one_thread
 from lcopa_bayes.results.alternatives import with_alternatives
 from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.results.fit import Fit
@@ -22,6 +22,7 @@ from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
 
+@on_one_thread
 def fit(
     study: StudyLike,
     *,

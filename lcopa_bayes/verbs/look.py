@@ -9,6 +9,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.core.files import csv_of
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
@@ -30,6 +31,7 @@ class LookResult(StoredResult):
         return pd.DataFrame(rows).rename(columns={"name": "parameter"})
 
 
+@on_one_thread
 def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
     """Fit a study by least squares and show what is left, before the posterior is sampled.
 

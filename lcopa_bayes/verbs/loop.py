@@ -10,6 +10,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
@@ -78,6 +79,7 @@ class LoopResult(StoredResult):
         return "\n".join(words(dict(self.values)))
 
 
+@on_one_thread
 def loop(
     study: FitLike,
     *,

@@ -13,6 +13,7 @@ import pandas as pd
 
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import csv_of
+from lcopa_bayes.core.parallel import on_one_thread
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import CLAIMS, judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
@@ -92,6 +93,7 @@ def optics(plan: OpticsPlan | None = None) -> OpticsResult:
     return OpticsResult(static_optics(plan or OpticsPlan()).values, provenance(None, "optics"))
 
 
+@on_one_thread
 def identify(
     study: FitLike,
     *,

@@ -1,5 +1,6 @@
 """Who does independent tasks."""
 
+import inspect
 import os
 import platform
 import resource
@@ -12,11 +13,12 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
+import lcopa_bayes as lb
 from lcopa_bayes.core import parallel
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.parallel import meanwhile, workers
+from lcopa_bayes.core.parallel import meanwhile, on_one_thread, workers
 
 
 def threads(size, seed):
@@ -229,3 +231,32 @@ def test_what_no_other_process_can_read_is_done_in_this_one(where):
 
 def added(shared: int, one: int) -> int:
     return int(shared) + int(one)
+
+
+def test_a_function_on_one_thread_leaves_the_others_theirs():
+    with threadpool_limits(2):
+        assert on_one_thread(threads)(3, seed=1)[1] == 1
+        assert threads(3, 1)[1] == 2
+        with pytest.raises(ZeroDivisionError):
+            on_one_thread(over)(1, 0)
+        assert threads(3, 1)[1] == 2
+    assert on_one_thread(threads).__name__ == "threads"
+
+
+VERBS = ("look", "fit", "loop", "compare", "calibrate", "design", "audit")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_calculates_on_one_thread(verb, monkeypatch):
+    """Whatever the calling process has: from Python nothing else limits it."""
+    function, seen = getattr(lb, verb), []
+    module = sys.modules[inspect.unwrap(function).__module__]
+
+    def asked(*_, **__):
+        seen.append(max(pool["num_threads"] for pool in threadpool_info()))
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(module, {"compare": "several", "audit": "basis"}.get(verb, "study_of"), asked)
+    with threadpool_limits(2), pytest.raises(ZeroDivisionError):
+        function("a study")
+    assert seen == [1]
