@@ -32,8 +32,20 @@ def _norm(x: Vector, p: Mapping[str, float]) -> Vector:
     return -log(sd) - 0.5 * log(2 * pi) - 0.5 * ((x - mean) / sd) ** 2
 
 
-_CLOSED = {"uniform": _uniform, "loguniform": _loguniform, "norm": _norm}
-_CLOSED_PARAMETERS = {"uniform": {"loc", "scale"}, "loguniform": {"a", "b"}, "norm": {"loc", "scale"}}
+def _lognorm(x: Vector, p: Mapping[str, float]) -> Vector:
+    inside, sd = (x > 0) & (x < np.inf), p["s"]
+    log_x = np.log(np.where(inside, x, 1.0))
+    level = -log(sd) - 0.5 * log(2 * pi)
+    return np.where(inside, level - log_x - 0.5 * ((log_x - log(p.get("scale", 1.0))) / sd) ** 2, -np.inf)
+
+
+_CLOSED = {"uniform": _uniform, "loguniform": _loguniform, "norm": _norm, "lognorm": _lognorm}
+_CLOSED_PARAMETERS = {
+    "uniform": {"loc", "scale"},
+    "loguniform": {"a", "b"},
+    "norm": {"loc", "scale"},
+    "lognorm": {"s", "scale"},
+}
 """Closed forms are ten times faster than scipy's general path and tested against it."""
 
 

@@ -42,10 +42,18 @@ def test_closed_loguniform_is_scipys(a, ratio):
     agrees(Prior("loguniform", {"a": a, "b": a * ratio}), x)
 
 
+@given(st.floats(0.01, 10.0), st.floats(1e-9, 1e9))
+def test_closed_lognorm_is_scipys(sd, scale):
+    x = np.concatenate([GRID, scale * np.exp(sd * np.array([-9.0, 0.0, 0.1, 9.0])), [0.0, -scale, np.inf]])
+    agrees(Prior("lognorm", {"s": sd, "scale": scale}), x)
+    agrees(Prior("lognorm", {"s": sd}), x)
+
+
 @pytest.mark.parametrize(
     ("dist", "parameters"),
     [
         ("lognorm", {"s": 0.5, "scale": 3.0}),
+        ("lognorm", {"s": 0.5, "scale": 3.0, "loc": -1.0}),
         ("gamma", {"a": 2.0, "scale": 10.0}),
         ("loguniform", {"a": 1.0, "b": 9.0, "loc": -4.0}),
         ("uniform", {}),
