@@ -323,6 +323,7 @@ def _take_up(shared: bytes | None) -> None:
     if sys.platform == "linux":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threadpool_limits(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # of libraries that tasks load later
     _shared = None if shared is None else unpacked(shared)
     Thread(target=_end_with_parent, daemon=True).start()
 

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import lcopa_bayes as lb
 from lcopa_bayes.core import parallel
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.parallel import meanwhile, on_one_thread, workers
+from lcopa_bayes.core.parallel import cores, meanwhile, on_one_thread, workers
 
 
 def threads(size, seed):
@@ -231,6 +231,32 @@ def test_what_no_other_process_can_read_is_done_in_this_one(where):
 
 def added(shared: int, one: int) -> int:
     return int(shared) + int(one)
+
+
+LATE = """
+from threadpoolctl import threadpool_info
+def loaded(shared, one):
+    import sys
+    late = "sklearn" not in sys.modules
+    import sklearn.cluster
+    return late, max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "openmp")
+"""
+LATER = """
+from late import loaded
+from lcopa_bayes.core.parallel import workers
+with workers(None, jobs=2) as crew:
+    for seen in crew.each(loaded, [1, 2]):
+        print(*seen)
+"""
+
+
+@pytest.mark.skipif(cores() < 2, reason="on one core nothing takes more threads")
+def test_what_a_worker_loads_later_has_one_thread_too(tmp_path):
+    (tmp_path / "late.py").write_text(LATE)
+    (tmp_path / "main.py").write_text(LATER)
+    free = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    ran = subprocess.run([sys.executable, "main.py"], cwd=tmp_path, env=free, capture_output=True, text=True)
+    assert ran.stdout.splitlines() == ["True 1"] * 2, ran.stderr
 
 
 def test_a_function_on_one_thread_leaves_the_others_theirs():
