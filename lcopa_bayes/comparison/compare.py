@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.averaging import Gain, averaged, by_prediction, stretches, total_sd
 from lcopa_bayes.comparison.candidatefit import REJECTED, Contender, contender
@@ -24,7 +23,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import on_one_thread, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
@@ -268,9 +267,9 @@ def _performed(tasks: Sequence[Contender | Check], jobs: int) -> Iterator[Mappin
         yield from crew.finished(_perform, ranked)
 
 
+@on_one_thread
 def _rough(_: None, task: Contender) -> float | None:
-    with threadpool_limits(1):
-        return task.rough
+    return task.rough
 
 
 def _perform(_: None, task: Contender | Check) -> Mapping[str, Any]:

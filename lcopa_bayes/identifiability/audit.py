@@ -11,11 +11,10 @@ from typing import Any, final
 
 import numpy as np
 from scipy.optimize import least_squares
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import on_one_thread, workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
     Tolerance,
@@ -195,26 +194,26 @@ def _structure(structure: Structure) -> dict[str, Any]:
     }
 
 
+@on_one_thread
 def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     """Verdict for every free parameter of a fitted study; profiles are calculated in `jobs` processes."""
     posterior, seed = fit.problem.posterior, fit.study.seed
     landscape, rng = Landscape(posterior), np.random.default_rng([seed, 5])
-    with threadpool_limits(1):
-        prior = prior_draws(landscape, rng)
-        spread = prior_spread(landscape, prior)
-        thinned = fit.draws.thinned(_WITNESSES)
-        surrogate = None
-        if posterior.simulation is not None:  # a profile asks for the likelihood 100 000 times
-            surrogate = surrogate_about(posterior, fit.draws, rng, jobs=jobs)
-        ground = Landscape.about(replace(posterior, surrogate=surrogate), fit.draws.flat)
-        ranked = thinned[np.argsort(-ground.log_likelihood(thinned))]
-        likely = ranked[:_CLIMBED]
-        optima = np.empty((0, prior.shape[1]))
-        if surrogate is None:
-            optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
-        starts = np.concatenate([optima, likely])
-        peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
-        known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
+    prior = prior_draws(landscape, rng)
+    spread = prior_spread(landscape, prior)
+    thinned = fit.draws.thinned(_WITNESSES)
+    surrogate = None
+    if posterior.simulation is not None:  # a profile asks for the likelihood 100 000 times
+        surrogate = surrogate_about(posterior, fit.draws, rng, jobs=jobs)
+    ground = Landscape.about(replace(posterior, surrogate=surrogate), fit.draws.flat)
+    ranked = thinned[np.argsort(-ground.log_likelihood(thinned))]
+    likely = ranked[:_CLIMBED]
+    optima = np.empty((0, prior.shape[1]))
+    if surrogate is None:
+        optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
+    starts = np.concatenate([optima, likely])
+    peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
+    known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
     rough = Landscape(fit.problem.thrifty.posterior)
     profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
     count = _POINTS if posterior.simulation is None else _FEWER

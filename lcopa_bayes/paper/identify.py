@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import on_one_thread, workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
@@ -176,41 +175,41 @@ def _within_study(plan: Scan, study: Study) -> Scan:
     return replace(plan, orders=tuple(Interval(order, order) for order in distinct))
 
 
+@on_one_thread
 def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = None) -> Identification:
-    with threadpool_limits(1):
-        fixed, whole = study.model.orders != "free", integer_orders(data.terms)
-        rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))
-        scanned = []
-        for title, count, limits, normalisation in (
-            ("k given", data.terms, plan, Normalisation.STIFFNESS),
-            ("last eta = 1", data.terms, plan, Normalisation.LAST_ETA),
-            ("integer orders", len(whole), rigid, Normalisation.STIFFNESS),
-        ):
-            if bar is not None:
-                bar.set_description(f"{data.name}, {title}")
-            best = scan(data.blocks, count, data.span, limits, normalisation=normalisation, bar=bar)
-            scanned.append(_described(f"scan, {title}", data, best.model, best))
-        winner = scanned[0].model
+    fixed, whole = study.model.orders != "free", integer_orders(data.terms)
+    rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))
+    scanned = []
+    for title, count, limits, normalisation in (
+        ("k given", data.terms, plan, Normalisation.STIFFNESS),
+        ("last eta = 1", data.terms, plan, Normalisation.LAST_ETA),
+        ("integer orders", len(whole), rigid, Normalisation.STIFFNESS),
+    ):
         if bar is not None:
-            bar.set_description(f"{data.name}, output error")
-        rng = np.random.default_rng([study.seed, data.response, data.drive])
-        free = output_error_fit(
-            study, data, rng, terms=data.terms, orders=winner.orders if fixed else "free", start=winner
-        )
-        rival = scanned[2].model
-        stiff = output_error_fit(study, data, rng, terms=len(whole), orders=whole, start=rival)
-        with_k = {
-            k: least_squares(data.blocks, winner.orders, winner.delay, known=k) for k in plan.stiffness
-        }  # Eq. 63 solved anew at the winner's orders and delay
-        return Identification(
-            data,
-            scanned[0],
-            scanned[1],
-            _described("output error", data, free),
-            scanned[2],
-            _described("output error, integer orders", data, stiff),
-            tuple((k, output_rmse(data.records, model)) for k, model in with_k.items()),
-        )
+            bar.set_description(f"{data.name}, {title}")
+        best = scan(data.blocks, count, data.span, limits, normalisation=normalisation, bar=bar)
+        scanned.append(_described(f"scan, {title}", data, best.model, best))
+    winner = scanned[0].model
+    if bar is not None:
+        bar.set_description(f"{data.name}, output error")
+    rng = np.random.default_rng([study.seed, data.response, data.drive])
+    free = output_error_fit(
+        study, data, rng, terms=data.terms, orders=winner.orders if fixed else "free", start=winner
+    )
+    rival = scanned[2].model
+    stiff = output_error_fit(study, data, rng, terms=len(whole), orders=whole, start=rival)
+    with_k = {
+        k: least_squares(data.blocks, winner.orders, winner.delay, known=k) for k in plan.stiffness
+    }  # Eq. 63 solved anew at the winner's orders and delay
+    return Identification(
+        data,
+        scanned[0],
+        scanned[1],
+        _described("output error", data, free),
+        scanned[2],
+        _described("output error, integer orders", data, stiff),
+        tuple((k, output_rmse(data.records, model)) for k, model in with_k.items()),
+    )
 
 
 def _described(

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.estimate import attributes
-from lcopa_bayes.core.parallel import Workers, workers
+from lcopa_bayes.core.parallel import Workers, on_one_thread, workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -136,19 +136,19 @@ class Discretisation:
         }
 
 
+@on_one_thread
 def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
     The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
     known already.
     """
-    with threadpool_limits(1):  # matrices are small: more threads only wait for each other
-        if optima is None:
-            optima = optima_of(problem)
-        if not optima:
-            return problem
-        best = optima[0].values
-        return narrowed(problem, lambda each: optimum_shift(each, best))
+    if optima is None:
+        optima = optima_of(problem)
+    if not optima:
+        return problem
+    best = optima[0].values
+    return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
 def optima_of(
