@@ -15,7 +15,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.model.effects.parallel import relaxing, summed
+from lcopa_bayes.model.effects.parallel import relaxation, summed
 from lcopa_bayes.model.effects.response import CrossFade
 from lcopa_bayes.model.forward import forward_model
 
@@ -133,7 +133,21 @@ def test_many_changes_under_few_samples(samples: int):
     rng = np.random.default_rng(3)
     drive = AxisDrive(0.05 + 0.11 * np.arange(80), rng.normal(size=80))
     times = np.linspace(0.0, 10.0, samples) if samples > 1 else np.array([9.0])
-    total = summed(times, drive, 0.3, drive.jumps, relaxing(0.4))
+    total = summed(times, drive, 0.3, drive.jumps, lambda t: -np.expm1(-t / 0.4))
     late = np.maximum(times[:, None] - drive.times - 0.3, 0.0)
     exact = (-np.expm1(-late / 0.4)) @ drive.jumps
     assert np.abs(total - exact).max() < (1e-12 if samples < 80 else 1e-2)
+
+
+@pytest.mark.parametrize("changes", [0, 1, 80])
+@pytest.mark.parametrize(("rate", "weight"), [(2.5, 1.0), (1e-9, 1.0), (1e9, 1.0), (0.3 + 40j, 1 + 0.2j)])
+def test_a_relaxation_is_the_sum_change_by_change(changes: int, rate: complex, weight: complex):
+    """At changes, between them and before the first, under drives that follow each other at once too."""
+    rng = np.random.default_rng(5)
+    begin = np.sort(rng.uniform(0.0, 6.0, changes))
+    drive = AxisDrive(begin, rng.normal(size=changes))
+    times = np.sort(np.concatenate([[-1.0, 0.0, 12.0], begin + 0.25, rng.uniform(0.0, 10.0, 60)]))
+    late = times[:, None] - (drive.times + 0.25)
+    shape = np.where(late >= 0, 1 - (weight * np.exp(-rate * np.maximum(late, 0.0))).real, 0.0)
+    total = relaxation(times, drive, 0.25, drive.jumps, rate, weight)
+    assert_allclose(total, shape @ drive.jumps, atol=1e-12 * max(changes, 1))

@@ -18,7 +18,7 @@ from lcopa_bayes.model.effects.effect import (
     per_axis,
     single,
 )
-from lcopa_bayes.model.effects.parallel import falling, relaxed, relaxing, summed
+from lcopa_bayes.model.effects.parallel import falling, relaxation, relaxed
 
 _LAGS = 6
 _WAVES = 8
@@ -155,7 +155,7 @@ class UnmodelledNonlinear(ParallelEffect):
             for (level, jumps), mine in zip(inputs, kinds, strict=True):
                 for c, part in zip(mine, _PARTS, strict=True):
                     if c != 0.0:
-                        lag = relaxing(part * scene.ranges.speed)
-                        moved = summed(scene.times, drive, delay, jumps, lag)
+                        rate = 1 / (part * scene.ranges.speed)
+                        moved = relaxation(scene.times, drive, delay, jumps, rate)
                         out[:, axis] += c * gain * size * (level + moved)
         return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from math import ceil
 from types import MappingProxyType
 from typing import ClassVar, Self, final
@@ -90,9 +91,26 @@ def _convolved(
     return np.asarray(fftconvolve(kernel, dense)[-begin : size - begin])
 
 
-def relaxing(time: float) -> Callable[[Array], Array]:
-    """``1 - exp(-t / time)``."""
-    return lambda t: np.asarray(-np.expm1(-t / time))
+def relaxation(
+    times: Vector, drive: AxisDrive, delay: float, jumps: Vector, rate: complex, weight: complex = 1.0
+) -> Vector:
+    """``sum_k jumps_k (1 - Re(weight exp(-rate (t - t_k - delay))))`` over the changes up to t, (samples,).
+
+    What is lacking of the sum after a change is what was lacking after the one before, decayed, and the jump:
+    one exponential for each sample, whatever the number of changes; exact.
+    """
+    at, out = drive.times + delay, np.zeros(times.size)
+    if not at.size:
+        return out
+    kept = np.exp(-rate * np.diff(at))
+    steps = zip([0.0, *kept.tolist()], jumps.tolist(), strict=True)
+    lacking = np.array([*accumulate(steps, lambda left, step: left * step[0] + step[1], initial=0.0)][1:])
+    last = np.searchsorted(at, times, side="right") - 1
+    first = int(np.searchsorted(last, 0))
+    last = last[first:]
+    decayed = weight * lacking[last] * np.exp(-rate * (times[first:] - at[last]))
+    out[first:] = np.cumsum(jumps)[last] - decayed.real
+    return out
 
 
 def falling(drive: AxisDrive, rest: float) -> Array:
@@ -104,11 +122,11 @@ def falling(drive: AxisDrive, rest: float) -> Array:
 def relaxed(scene: Scene, response: int, drive: int, lag: float) -> Vector:
     """A drive after the delay of its path to a response and a lag [time unit], (samples,) [drive unit]."""
     own, delay = scene.drives[drive], float(scene.delays[response, drive])
-    return np.asarray(scene.rest[drive] + summed(scene.times, own, delay, own.jumps, relaxing(lag)))
+    return np.asarray(scene.rest[drive] + relaxation(scene.times, own, delay, own.jumps, 1 / lag))
 
 
-def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) -> Matrix:
-    """``size K (rest + sum_k jump_k shape(t - t_k - delay))`` of every axis, (samples, axes).
+def own_responses(scene: Scene, size: float, rate: complex, weight: complex = 1.0) -> Matrix:
+    """``size K (rest + relaxation)`` of every axis, (samples, axes).
 
     K is the gain of the path from the axis' own drive, which arrives after its delay.
     """
@@ -116,7 +134,8 @@ def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) ->
     for axis in range(scene.ranges.axes):
         drive, rest, gain, delay = scene.direct(axis)
         if size * gain:  # a likelihood asks for one path after the other
-            out[:, axis] = size * gain * (rest + summed(scene.times, drive, delay, drive.jumps, shape))
+            moved = relaxation(scene.times, drive, delay, drive.jumps, rate, weight)
+            out[:, axis] = size * gain * (rest + moved)
     return out
 
 
@@ -148,7 +167,7 @@ class IonCreep(ParallelEffect):
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One exponential per change."""
-        return own_responses(scene, psi[0], relaxing(self.time))
+        return own_responses(scene, psi[0], 1 / self.time)
 
 
 @final
@@ -236,14 +255,8 @@ class ExtraMode(ParallelEffect):
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One damped oscillation per change."""
-        return own_responses(scene, psi[0], self.step)
-
-    def step(self, t: Array) -> Array:
-        """Response to a unit step."""
         w, root = 2 * np.pi * self.frequency, np.sqrt(1 - self.damping**2)
-        phase = w * root * t
-        wave = np.cos(phase) + self.damping / root * np.sin(phase)
-        return np.asarray(1 - np.exp(-self.damping * w * t) * wave)
+        return own_responses(scene, psi[0], w * complex(self.damping, root), complex(1, self.damping / root))
 
 
 @final
