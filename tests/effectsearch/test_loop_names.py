@@ -143,16 +143,20 @@ def test_limits_that_differ_from_axis_to_axis_are_found():
 
 def test_a_resonance_may_ring_longer_than_those_that_are_traced():
     """A damping below the grid's is reached, and is open in the explained study."""
-    one, mode = commanded("r0", 0), ExtraMode(0.3, 0.012)
+    one, frequency, damping = commanded("r0", 0), 0.3, 0.012
     rows = np.flatnonzero(np.diff(one.drive[:, 0], prepend=0.0))
     jumps = np.diff(one.drive[:, 0], prepend=0.0)[rows]
     since = np.maximum(one.time[:, None] - one.time[rows] - DELAY, 0.0)
-    ringing = replace(one, response=one.response + 0.05 * (mode.step(since) @ jumps)[:, None])
+    w, root = 2 * np.pi * frequency * since, np.sqrt(1 - damping**2)
+    step = 1 - np.exp(-damping * w) * (np.cos(w * root) + damping / root * np.sin(w * root))
+    ringing = replace(one, response=one.response + 0.05 * (step @ jumps)[:, None])
     study = Study("s", None, "ms", 1, (ringing,), (), ModelSettings(offset="shared"))
     _, start = fitted(study)
     model = start.model.at_scales(start.optimum.x, {"r0": 0.0})
     made = refit(model, start.optimum, start.whitening, [(ExtraMode(0.29, 0.03), np.ones(1))], 500.0)
-    assert made.model.effects[0].constants == pytest.approx({"frequency": 0.3, "damping": 0.012}, rel=0.05)
+    assert made.model.effects[0].constants == pytest.approx(
+        {"frequency": frequency, "damping": damping}, rel=0.05
+    )
     assert explained_study(study, made.model).priors["extra_mode.damping"].fixed is None
 
 
