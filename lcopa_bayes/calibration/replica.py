@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import Literal, NamedTuple, final, get_args
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device
@@ -229,8 +228,7 @@ class Replication:
     def attempt(self, number: int) -> Outcome | Failure:
         """The replica, or what went wrong with it: the others go on, and it is reported with its seed."""
         try:
-            with threadpool_limits(1):
-                return self(number)
+            return self(number)
         except Exception as error:
             return Failure(number, self.seed_of(number), f"{type(error).__name__}: {error}")
 

@@ -23,7 +23,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder
-from lcopa_bayes.core.parallel import on_one_thread, workers
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
@@ -267,7 +267,6 @@ def _performed(tasks: Sequence[Contender | Check], jobs: int) -> Iterator[Mappin
         yield from crew.finished(_perform, ranked)
 
 
-@on_one_thread
 def _rough(_: None, task: Contender) -> float | None:
     return task.rough
 

@@ -15,7 +15,6 @@ from typing import Any, final
 
 import numpy as np
 from scipy.special import expit, logsumexp
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.candidatefit import Contender, criteria, highest
 from lcopa_bayes.comparison.candidates import Candidate
@@ -60,8 +59,7 @@ class Check:
         """The card with what was found under `containment`; that of a new fit where a mode was missed."""
         if self.card.get("containment", {}).get("key") == self._key:
             return self.card
-        with threadpool_limits(1):
-            entries = self._checked()
+        entries = self._checked()
         self.contender.store(entries)
         return entries
 

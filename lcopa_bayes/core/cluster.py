@@ -141,9 +141,10 @@ def _versions() -> dict[str, str]:
 def _perform(work: bytes, shared: bytes | None, given: bytes) -> Any:
     """A task on a worker. It gives no work to the cluster itself, so that xarray takes no lock of the
     scheduler for a file in memory, which that has no name for."""
-    with import_module("dask").config.set(scheduler="synchronous"), threadpool_limits(1):
-        common = None if shared is None else _unpacked(shared)
-        return _unpacked(work)(common, unpacked(given))
+    with import_module("dask").config.set(scheduler="synchronous"):
+        task, common = _unpacked(work), None if shared is None else _unpacked(shared)
+        with threadpool_limits(1):  # of what these have loaded too
+            return task(common, unpacked(given))
 
 
 def _same(sent: bytes) -> bytes:

@@ -119,7 +119,8 @@ def on_cluster(address: str | None) -> Iterator[int]:
 
 
 def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """The function with one thread for the linear algebra of this process.
+    """The function with one thread for the linear algebra of this process. Verbs are such functions, and
+    workers begin so, so that what these call need not be.
 
     Matrices are small, and threads wait for each other: beside other work on the same cores half of the time
     of a fit of 120 samples.

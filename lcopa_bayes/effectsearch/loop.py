@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from typing import Self, final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.crew import WORTHWHILE, Crew
 from lcopa_bayes.core.errors import InputError
@@ -75,9 +74,7 @@ def loop(
             "so leave `use` out of [effects]"
         )
     kinds = offered(study) if library is None else list(library)
-    # many small products: more threads only wait for each other
     with (
-        threadpool_limits(1),
         Progress(total=0, unit="task", quiet=quiet, desc="fitting the plant without effects") as bar,
         Crew(jobs, after=WORTHWHILE, bar=bar) as crew,
     ):

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import on_one_thread, workers
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
     Tolerance,
@@ -194,7 +194,6 @@ def _structure(structure: Structure) -> dict[str, Any]:
     }
 
 
-@on_one_thread
 def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     """Verdict for every free parameter of a fitted study; profiles are calculated in `jobs` processes."""
     posterior, seed = fit.problem.posterior, fit.study.seed

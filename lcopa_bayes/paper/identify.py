@@ -13,7 +13,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import on_one_thread, workers
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
@@ -175,7 +175,6 @@ def _within_study(plan: Scan, study: Study) -> Scan:
     return replace(plan, orders=tuple(Interval(order, order) for order in distinct))
 
 
-@on_one_thread
 def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = None) -> Identification:
     fixed, whole = study.model.orders != "free", integer_orders(data.terms)
     rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))

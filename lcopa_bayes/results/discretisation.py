@@ -16,12 +16,11 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.estimate import attributes
-from lcopa_bayes.core.parallel import Workers, on_one_thread, workers
+from lcopa_bayes.core.parallel import Workers, workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -136,7 +135,6 @@ class Discretisation:
         }
 
 
-@on_one_thread
 def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
@@ -168,8 +166,7 @@ def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Proble
     narrow = resolved(problem, optima)
     if narrow is problem:
         return problem, tuple(optima)
-    with threadpool_limits(1):
-        found = again(narrow.posterior, optima, begun=True)
+    found = again(narrow.posterior, optima, begun=True)
     return (narrow, found) if problem.ranges is None or not found else resolved_optima(narrow, found)
 
 
