@@ -85,10 +85,13 @@ def large(candidate: Refit) -> bool:
 
 def leader(accepted: Sequence[Refit]) -> Refit | None:
     """The refit of largest evidence; of those level with it the first whose coefficients all records share,
-    since one of a single record predicts no other."""
-    level = [one for one in accepted if one.log_bayes_factor > accepted[0].log_bayes_factor - MARGIN]
+    since one of a single record predicts no other, unless it predicts records left out worse."""
+    if not accepted:
+        return None
+    first = accepted[0]
+    level = [one for one in accepted if one.log_bayes_factor > first.log_bayes_factor - MARGIN]
     shared = (one for one in level if not any(c.record is not None for c in one.new))
-    return next(shared, accepted[0] if accepted else None)
+    return next((one for one in shared if one.left_out > first.left_out - MARGIN), first)
 
 
 def single_record(study: Study) -> tuple[str, ...]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, cast, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.agreement import Disagreement
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
@@ -17,7 +15,7 @@ from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
 from lcopa_bayes.effectsearch.extrapolation import Extrapolated
 from lcopa_bayes.effectsearch.findings import Side, unfollowed
 from lcopa_bayes.effectsearch.lags import at_noise, ess_with_lags, figures_with_lags, number_with_lags
-from lcopa_bayes.effectsearch.openeffects import Alternative, Weighed, mixture, step_figures
+from lcopa_bayes.effectsearch.openeffects import Alternative, Mixture, Weighed, mixture, step_figures
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying
 from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
@@ -135,10 +133,11 @@ class Loop:
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""
         row = self._row(k)
-        pairs = zip(*self._mixture, strict=True)
-        own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
-        shares = np.array([weight for _, weight in own])
-        number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+        drawn = self._mixture
+        having = [number for number, part in enumerate(drawn.parts) if k < part.shape[1]]
+        values, shares = [row.value_at(drawn.parts[one][:, k]) for one in having], drawn.weights[having]
+        rivals = tuple(place for place, one in enumerate(having) if one in drawn.rivals)
+        number = Weighed(row.name, row.unit, values, shares / shares.sum(), rivals=rivals)
         number = self.plants.number(number, row)
         return number_with_lags(number, row, self.lags, self.after.state.model.plant.table.layout)
 
@@ -146,18 +145,19 @@ class Loop:
     def figures(self) -> tuple[Weighed, ...]:
         """Figures of the plant's response to a unit step over the longest record, its effects aside, over the
         same models."""
-        own, layout = (self.figures_of(self.after.state, *self._mixture), self.problem.posterior.table.layout)
+        own, layout = self.figures_of(self.after.state, self._mixture), self.problem.posterior.table.layout
         span, unit = self.problem.scales.span, self.problem.study.time_unit
         own = self.plants.figures(own, span=span, time_unit=unit)
         return figures_with_lags(own, self.lags, layout, span=span, time_unit=unit)
 
-    def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
-        """The same of any `mixture`."""
-        span, unit = self.problem.scales.span, self.problem.study.time_unit
-        return step_figures(state, parts, weights, span=span, time_unit=unit)
+    def figures_of(self, state: State, drawn: Mixture) -> tuple[Weighed, ...]:
+        """The same of any mixture."""
+        return step_figures(
+            state, drawn, span=self.problem.scales.span, time_unit=self.problem.study.time_unit
+        )
 
     @cached_property
-    def _mixture(self) -> tuple[list[Matrix], Vector]:
+    def _mixture(self) -> Mixture:
         state = self.after.state
         if self.draws is None:
             return mixture(self.loose or state, None, self.open)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from scipy.stats import truncnorm
@@ -82,6 +82,11 @@ class Alternative:
     instance: Effect | None = None
     """That instance."""
 
+    @property
+    def rival(self) -> bool:
+        """Whether it has another effect in place of one of the final model."""
+        return bool(self.instead) and self.instance is None
+
     def within(self, table: ParameterTable) -> bool:
         """Whether it is an instance that the free constants of a table reach."""
         for key, value in self.instance.constants.items() if self.instance else ():
@@ -111,9 +116,24 @@ def alternatives(state: State, rounds: Sequence[Round], known: str = "") -> tupl
     return (*_beside(state, seen, known), *_instead(state, rounds), *_elsewhere(state, seen.scale))
 
 
-def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> tuple[list[Matrix], Vector]:
+@final
+class Mixture(NamedTuple):
+    """Draws of a final model and of what is open to it."""
+
+    parts: Sequence[Matrix]
+    """Coordinates of each, (draws, k), those of the final model first."""
+    weights: Vector
+    """Of the parts; they add up to 1."""
+    rivals: tuple[int, ...] = ()
+    """Parts that have another effect in place of one of the final model."""
+
+
+def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> Mixture:
     """Draws of the final model, `own` or else those about its optimum that follow the records, and of each
-    alternative, inside the support of the coordinates; and their weights, which add up to 1."""
+    alternative, inside the support of the coordinates.
+
+    What stands in place of an effect may have one more beside it too, with the odds that the final model has.
+    """
     rng = np.random.default_rng(_SEED)
     x, (low, high) = state.optimum.x, state.model.bounds
 
@@ -123,14 +143,16 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
 
     if own is None:
         own = draws_about(state, rng, _FOLLOWING)
-    parts, weights = [own], [1.0]
+    parts, weights, rivals = [own], [1.0], []
+    with_others = 1.0 + sum(one.weight for one in found if not one.instead)
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)
         inside = within(drawn)
         if inside.any():
+            rivals += [len(parts)] if one.rival else []
             parts.append(drawn[inside])
-            weights.append(one.weight * float(inside.mean()))
-    return parts, np.array(weights) / sum(weights)
+            weights.append(one.weight * (with_others if one.instead else 1.0) * float(inside.mean()))
+    return Mixture(parts, np.array(weights) / sum(weights), tuple(rivals))
 
 
 @final
@@ -145,6 +167,8 @@ class Weighed:
     weights: Vector
     """Of the parts; they add up to 1."""
     note: str = ""
+    rivals: tuple[int, ...] = ()
+    """Parts that have another effect in place of one of the final model."""
 
     @property
     def values(self) -> Vector:
@@ -152,11 +176,15 @@ class Weighed:
         return pooled(self.parts, self.weights)
 
     def beside(self, others: Sequence[Vector], weight: float) -> Weighed:
-        """Over further parts too, which have this weight together."""
+        """Over further parts too, with the effects of the final model, which have this weight together beside
+        the others with these effects."""
         if not others:
             return self
-        shares = [*((1 - weight) * self.weights), *np.full(len(others), weight / len(others))]
-        return replace(self, parts=[*self.parts, *others], weights=np.array(shares))
+        rival = np.isin(np.arange(len(self.parts)), self.rivals)
+        left = np.where(rival, self.weights, (1 - weight) * self.weights)
+        theirs = weight * float(self.weights[~rival].sum()) / len(others)
+        shares = np.concatenate((left, np.full(len(others), theirs)))
+        return replace(self, parts=[*self.parts, *others], weights=shares)
 
     def as_json(self, *, ess: float, grade: str, interval: str) -> dict[str, Any]:
         """Median and 90 % interval, the standard deviations by noise and by structure, and lower end, median
@@ -169,28 +197,31 @@ class Weighed:
         return plain(estimate.as_json() | more)
 
 
-def step_figures(
-    state: State, parts: Sequence[Matrix], weights: Vector, *, span: float, time_unit: str
-) -> tuple[Weighed, ...]:
+def step_figures(state: State, drawn: Mixture, *, span: float, time_unit: str) -> tuple[Weighed, ...]:
     """Figures of the plant's response to a unit step over `span` [time unit], its effects aside, over the
-    draws of a `mixture`; none where no draw of the final model is a plant."""
+    draws of a mixture; none where no draw of the final model is a plant."""
     model = state.model
     table = model.plant.table
     kept: list[Matrix] = []
     shares: list[float] = []
-    for part, weight in zip(parts, weights, strict=True):
+    rivals: list[int] = []
+    for number, (part, weight) in enumerate(zip(drawn.parts, drawn.weights, strict=True)):
         count = min(max(round(_RESPONSES * weight), _FEWEST), len(part))
         values = model.plants(part[np.linspace(0, len(part) - 1, count).astype(int)])
         values = values[table.supported(values)]
         if not len(values) and not kept:
             return ()
         if len(values):
+            rivals += [len(kept)] if number in drawn.rivals else []
             kept.append(values)
             shares.append(weight)
     every, ends = np.concatenate(kept), np.cumsum([len(one) for one in kept])[:-1]
     found = metrics_of(table, curves_of(table, every, span), time_unit=time_unit)
     share = np.array(shares) / sum(shares)
-    return tuple(Weighed(one.name, one.unit, np.split(one.values, ends), share, one.note) for one in found)
+    return tuple(
+        Weighed(one.name, one.unit, np.split(one.values, ends), share, one.note, tuple(rivals))
+        for one in found
+    )
 
 
 def odds(seen: Trace, log_bayes_factor: float, beforehand: float | None = None) -> float:

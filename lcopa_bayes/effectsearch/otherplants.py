@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.effectsearch.drawsabout import draws_about
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.openeffects import step_figures
+from lcopa_bayes.effectsearch.openeffects import Mixture, step_figures
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.scores import State
 
@@ -47,7 +47,7 @@ class OtherPlant:
 
     def figures(self, *, span: float, time_unit: str) -> dict[str, Vector]:
         """Those of its response to a unit step over `span` [time unit], by name."""
-        found = step_figures(self.state, [self.draws], np.ones(1), span=span, time_unit=time_unit)
+        found = step_figures(self.state, Mixture([self.draws], np.ones(1)), span=span, time_unit=time_unit)
         return {one.name: one.values for one in found}
 
     def number(self, name: str) -> Vector | None:

@@ -204,7 +204,7 @@ def places(
 
 def side_figures(found: Loop, side: Side) -> tuple[Weighed, ...]:
     """Figures of one side alone."""
-    return found.figures_of(side.state, *mixture(side.state, None, ()))
+    return found.figures_of(side.state, mixture(side.state, None, ()))
 
 
 def told_device(found: Loop, made: Campaign) -> Device:

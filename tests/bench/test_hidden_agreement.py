@@ -149,6 +149,7 @@ def test_nearly_every_effect_is_covered():
     assert set(bundled()) - set(SHARED) == NO_MEAN | {
         "pointing_drift",
         "sampled_drive",
+        "late_logging",
         "unmodelled_linear",
         "unmodelled_lag",
         "unmodelled_smooth",

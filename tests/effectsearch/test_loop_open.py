@@ -16,7 +16,17 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.loopresult import Loop
 from lcopa_bayes.effectsearch.noiselaw import Law
-from lcopa_bayes.effectsearch.openeffects import LEAST, Alternative, _step, alternatives, mixture, odds
+from lcopa_bayes.effectsearch.openeffects import (
+    LEAST,
+    Alternative,
+    Mixture,
+    Weighed,
+    _step,
+    alternatives,
+    mixture,
+    odds,
+    step_figures,
+)
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
@@ -147,9 +157,44 @@ def test_draws_outside_the_support_take_weight_away(faint: Loop):
         -state.optimum.x[k] if not state.model.posterior.table.rows[state.model.columns[k]].log_scale else 0
     )
     one = Alternative("a", 1.0, far, 1e-9 * np.eye(far.size))
-    parts, weights = mixture(state, None, [one])
+    parts, weights, _ = mixture(state, None, [one])
     assert weights[1] == pytest.approx(1 / 3, abs=0.02)
     assert (parts[1] >= state.model.bounds[0]).all()
+
+
+def test_a_rival_may_have_one_more_effect_beside_it_too(faint: Loop):
+    """Second method: the sum over both, of odds that do not depend on each other."""
+    state = faint.after.state
+    size = state.optimum.x.size
+    still = np.zeros(size), 1e-9 * np.eye(size)
+    more, further = Alternative("more", 0.5, *still), Alternative("further", 0.25, *still)
+    rival = Alternative("rival", 0.6, *still, instead="pulse")
+    drawn = mixture(state, None, [more, rival, further])
+    odds_of = {(second, third): second * third for second in (1.0, 0.6) for third in (1.0, 0.5, 0.25)}
+    whole = sum(odds_of.values())
+    assert drawn.rivals == (2,)
+    assert drawn.weights[2] == pytest.approx(sum(v for (k, _), v in odds_of.items() if k == 0.6) / whole)
+    np.testing.assert_allclose(drawn.weights[[0, 1, 3]], np.array([1.0, 0.5, 0.25]) / whole)
+
+
+def test_what_stands_beside_the_final_model_takes_nothing_from_rivals_of_its_effects():
+    parts = [np.zeros(3), np.ones(3), np.full(3, 2.0)]
+    number = Weighed("a", "V", parts, np.array([0.5, 0.3, 0.2]), rivals=(1,))
+    over = number.beside([np.full(3, 3.0), np.full(3, 4.0)], 0.8)
+    np.testing.assert_allclose(over.weights, [0.1, 0.3, 0.04, 0.28, 0.28])
+    assert over.rivals == (1,)
+    again = over.beside([np.full(3, 5.0)], 0.5)
+    np.testing.assert_allclose(again.weights, [0.05, 0.3, 0.02, 0.14, 0.14, 0.35])
+
+
+def test_figures_know_which_of_their_parts_are_of_a_rival(faint: Loop):
+    state, x = faint.after.state, faint.after.state.optimum.x
+    outside = x.copy()
+    outside[np.isin(state.model.names, ("time_1", "order_1"))] = -30.0, 1.5  # no plant: its part is left out, and those after it move up
+    parts = [np.tile(one, (12, 1)) for one in (x, outside, x)]
+    shown = step_figures(state, Mixture(parts, np.array([0.5, 0.2, 0.3]), (2,)), span=50.0, time_unit="ms")
+    assert all(one.rivals == (1,) for one in shown)
+    np.testing.assert_allclose(shown[0].weights, [0.625, 0.375])
 
 
 def test_a_coefficient_of_one_sign_moves_to_one_side():
@@ -210,7 +255,7 @@ def test_coordinates_at_an_end_of_their_support_are_drawn_inside_of_it(faint: Lo
     stuck = np.isin(names, ("order_1", "time_1"))
     white = optimum.white + optimum.jacobian[:, stuck] @ (np.array([1.0, -1.5]) * optimum.sd[stuck])
     held = replace(state, optimum=replace(optimum, stuck=stuck, white=white))
-    (draws,), _ = mixture(held, None, [])
+    ((draws,), *_) = mixture(held, None, [])
     slope = optimum.jacobian.T @ white
     for k in np.flatnonzero(stuck):
         inward = np.sign(slope[k]) * (optimum.x[k] - draws[:, k])

@@ -19,7 +19,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import Base, fitted_base
 from lcopa_bayes.effectsearch.lags import figures_with_lags, fitted_plant, lags_of, linear_dynamics
-from lcopa_bayes.effectsearch.openeffects import step_figures
+from lcopa_bayes.effectsearch.openeffects import Mixture, step_figures
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.sumsoflags import Alternative, lags_beside, sentence_of, with_draws
 
@@ -118,7 +118,7 @@ def test_the_square_beside_other_paths_is_that_of_a_joint_fit():
 
 def test_figures_of_the_path_are_over_the_lags_and_those_of_the_other_are_not():
     state, layout = based().start, based().problem.posterior.table.layout
-    own = step_figures(state, [state.optimum.x[None]], np.ones(1), span=20.0, time_unit="s")
+    own = step_figures(state, Mixture([state.optimum.x[None]], np.ones(1)), span=20.0, time_unit="s")
     over = {one.name: one for one in figures_with_lags(own, found(), layout, span=20.0, time_unit="s")}
     assert len(over["steady_state[y_u2]"].parts) == 2
     assert len(over["steady_state[y_u1]"].parts) == 1

@@ -45,8 +45,8 @@ NAMES = [
     "refresh_hold", "grey_quantisation", "hysteresis", "ion_creep", "extra_mode", "missing_cross_path",
     "bilinear_crosstalk", "axis_rotation", "sensor_lag", "exposure", "clipping", "centroid_locking",
     "sampled_drive", "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
-    "trigger_jitter", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear", "unmodelled_lag",
-    "unmodelled_smooth", "unmodelled_nonlinear", "sampled_drive",
+    "trigger_jitter", "late_logging", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear",
+    "unmodelled_lag", "unmodelled_smooth", "unmodelled_nonlinear",
 ]  # fmt: skip
 ALL = bundled()
 

@@ -23,6 +23,7 @@ from lcopa_bayes.model.effects.effect import (
     per_axis,
     single,
 )
+from lcopa_bayes.model.layout import Layout
 
 
 @final
@@ -91,6 +92,38 @@ class TriggerJitter(DriveEffect):
     def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """All changes are shifted alike."""
         return drive.later(psi[0]), rest
+
+
+@final
+class LateLogging(DriveEffect):
+    """Changes that happen between two rows and are written with the second one."""
+
+    card: ClassVar[Card] = Card(
+        name="late_logging",
+        place="noise",
+        formula="t -> t - f (t - previous row) for each change, f one per record and drive",
+        source="loggers that write a change with the next row; up to one interval between rows",
+        reveals="repeats with changes at other instants between rows, rows that follow faster",
+        mistaken_for="refresh_hold, clock_skew; delay where rows are regular",
+        per_record=True,
+        disturbance=True,
+    )
+
+    @classmethod
+    def applies(cls, layout: Layout) -> bool:
+        """Of one drive `trigger_jitter` says the same."""
+        return len(layout.drives) > 1
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """f of every drive [-]."""
+        numbers = range(1, ranges.drive.size + 1)
+        return tuple(Coefficient(f"f_{n}", "-", 0.6, one_signed=True, share=True) for n in numbers)
+
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
+        """All changes of a drive by the same part of the interval before each."""
+        before = np.searchsorted(scene.times, drive.times) - 1
+        interval = np.where(before < 0, 0.0, drive.times - scene.times[before])
+        return drive.later(-psi[axis] * interval), rest
 
 
 @final
