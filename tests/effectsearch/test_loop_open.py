@@ -190,7 +190,8 @@ def test_what_stands_beside_the_final_model_takes_nothing_from_rivals_of_its_eff
 def test_figures_know_which_of_their_parts_are_of_a_rival(faint: Loop):
     state, x = faint.after.state, faint.after.state.optimum.x
     outside = x.copy()
-    outside[np.isin(state.model.names, ("time_1", "order_1"))] = -30.0, 1.5  # no plant: its part is left out, and those after it move up
+    # no plant: its part is left out, and those after it move up
+    outside[np.isin(state.model.names, ("time_1", "order_1"))] = -30.0, 1.5
     parts = [np.tile(one, (12, 1)) for one in (x, outside, x)]
     shown = step_figures(state, Mixture(parts, np.array([0.5, 0.2, 0.3]), (2,)), span=50.0, time_unit="ms")
     assert all(one.rivals == (1,) for one in shown)
