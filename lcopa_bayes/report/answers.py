@@ -123,6 +123,8 @@ def _loop(v: Values) -> _Answers:
         change = f"goes from {figures(before['rmse'])} to {error}" if names else f"errs by {error}"
         if after["rmse_over_noise"] is not None:
             change += f", {figures(after['rmse_over_noise'])} times the noise"
+            # an error far above the noise is no contradiction where the model leaves as much open
+            change += f"; the 90 % band holds {percent(after['coverage_90'])} of its samples"
         said = f"The worst held-out response, {after['record']}/{after['axis']}, {change}."
         yield f"How good is it{' with that' * bool(names)}?", said, "Errors before and after"
     found = [row for one in v["effects"] for row in one["parameters"]]

@@ -175,11 +175,11 @@ SAID = [
     ("loop", (), {"effects": [], "verdict": "unexplained"}, "What does the model lack?",
      "Something without a name (firm)."),
     ("loop", (), None, "How good", "The worst held-out response, r/x, goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rad "
-     "rms, 1.02 times the noise."),
+     "rms, 1.02 times the noise; the 90 % band holds 90 % of its samples."),
     ("loop", (), {"effects": [], "verdict": "clean"}, "How good is it?",
-     "The worst held-out response, r/x, errs by 2.00×10⁻⁴ rad rms, 1.02 times the noise."),
+     "The worst held-out response, r/x, errs by 2.00×10⁻⁴ rad rms, 1.02 times the noise; the 90 % band holds 90 % of its samples."),
     ("loop", ("after", "scores", 0, "unit"), "1", "How good is it with that?", "The worst held-out response, r/x, "
-     "goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rms, 1.02 times the noise."),
+     "goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rms, 1.02 times the noise; the 90 % band holds 90 % of its samples."),
     ("loop", (), None, "What was wrong", "Biased without it: gain by 15 sd."),
     ("loop", ("moved",), [], "What was wrong", "Without it no parameter was biased."),
     ("loop", ("effects", 0, "group"), ["creep", "drift"], "What stays uncertain?", "creep may as well be drift."),
