@@ -18,6 +18,8 @@ from lcopa_bayes.data.requirements import unmet_apart_from_rest, unmet_rest
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.findings import Side
+from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.mendedstudy import longer_delays, started
 from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor, paid, refit
 from lcopa_bayes.effectsearch.regression import Regression
@@ -26,6 +28,7 @@ from lcopa_bayes.effectsearch.rounds import Round, Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.spareterms import without_spare_terms, without_static_terms
 from lcopa_bayes.effectsearch.trace import trace
+from lcopa_bayes.effectsearch.verdict import Miss
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.elementterms import terms_in_words
@@ -186,6 +189,37 @@ def beside_effects(base: Base, searched: Search) -> Base | None:
     names = listed([effect.name for effect in chosen.model.effects])
     said += f": beside {names} what is added is worth {worth:.0f} nat, though not without."
     return best._replace(sentence=f"{base.sentence} {said}".strip())
+
+
+def beside_unseen(base: Base, searched: Search) -> Base | None:
+    """The richer base model whose errors on unseen records chance explains best, where it does not explain
+    those of the base model, of which a search finds nothing else; None where it does, or explains none.
+
+    Fitted records may not show a term that another drive shows: what they leave open, others decide.
+    """
+    if searched.state.model.effects or searched.rounds[-1].alarmed:
+        return None
+    own = _missed(base, searched.state)
+    if own is None or not own.significant:
+        return None
+    others = [(one, _missed(one, one.start)) for one in base.richer]
+    explained = [(one, miss) for one, miss in others if miss is not None and not miss.significant]
+    if not explained:
+        return None
+    best, miss = max(explained, key=lambda pair: pair[1].p)
+    what = "elements and delays of its own for every path"
+    what = what if best.counts == base.counts else terms_in_words(best.counts)
+    said = (
+        f"The base model has {what}: the fitted records ask for less, but unseen ones, which had a part in "
+        f"this choice, are missed by {own.ratio:.3g} times the noise then, and by {miss.ratio:.3g} with it."
+    )
+    return best._replace(sentence=f"{base.sentence} {said}".strip())
+
+
+def _missed(base: Base, state: State) -> Miss | None:
+    """Errors of a state of a base fit on unseen records beside what chance gives."""
+    side = Side.of(base.problem, state)
+    return missed(base.problem.study, side.fit, side.unseen, state)
 
 
 def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:

@@ -30,6 +30,7 @@ from lcopa_bayes.results.fit import plan_of, weighted_start
 from lcopa_bayes.sampling.draws import Draws, draws_of
 from lcopa_bayes.sampling.run import Run
 from lcopa_bayes.sampling.sampler import by_search
+from lcopa_bayes.sampling.separateaxes import separated
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _DRAWS, _STREAM = 100, 13
@@ -155,17 +156,23 @@ def _sampled(
     gains and offsets are searched too."""
     posterior, plan, begin = problem.posterior, plan_of(problem, quick=False), monotonic()
     limit = LIMIT if posterior.simulation is None else AROUND
-    plan = replace(plan, seconds=limit if plan.seconds is None else plan.seconds)
+    limit = limit if plan.seconds is None else plan.seconds
+    plan = replace(plan, seconds=limit)
     # what is tried next has the time that those before it left
-    around = partial(weighted_run, posterior, plan, jobs=jobs, quick=quick, optima=optima, begin=begin)
+    around = partial(weighted_run, posterior, jobs=jobs, quick=quick, optima=optima, begin=begin)
     plain = posterior.simulation is None and isinstance(posterior.noise, GaussianNoise)
     if not (plain and optima):
-        return around()
-    first = around(attempts=1)
+        return around(plan)
+    first = around(plan, attempts=1)
     if posterior.size > _SEARCHED or (first is not None and first[1].grade.level == "reliable"):
         return first
+    began = monotonic()
     run = by_search(posterior, plan, optima, jobs=jobs, rough=problem.rough, begin=begin)
-    return around() if run is None else (run, draws_of(posterior, run))
+    if run is not None:
+        return run, draws_of(posterior, run)
+    # one axis of several may have ended it: the others would have taken as long
+    others = max(len(separated(posterior, optima[0].values)) - 1, 0)
+    return around(replace(plan, seconds=max(limit - others * (monotonic() - began), 0.0)))
 
 
 def _values(posterior: Posterior, known: Mapping[str, float]) -> Vector:

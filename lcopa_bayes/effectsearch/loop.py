@@ -19,7 +19,13 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.acceptance import single_record
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import settled, too_smooth
-from lcopa_bayes.effectsearch.basemodel import Base, beside_effects, fitted_base, structure_chosen
+from lcopa_bayes.effectsearch.basemodel import (
+    Base,
+    beside_effects,
+    beside_unseen,
+    fitted_base,
+    structure_chosen,
+)
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.findings import Side, astray, findings_of, named_effects, predicts_better
@@ -39,6 +45,7 @@ from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.sensor import Exposure
+from lcopa_bayes.results.structure import with_least_terms
 from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.results.sumsoflags import with_draws
 from lcopa_bayes.sampling.draws import Draws
@@ -63,7 +70,7 @@ def loop(
 ) -> Loop:
     """Trace what a study's base model lacks; deterministic given the study's seed.
 
-    Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
+    Unless `as_stated`, a study of one viscous term or of "auto" gets as many as the evidence asks for. Without
     `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
     are drawn and ensembles are half as long. Unless `quiet` it says on standard error what it does and what
     it knows by then. InputError when the study does not fit its records, or uses effects already.
@@ -73,6 +80,7 @@ def loop(
             f"{study.name}: uses {', '.join(study.effects.use)} already; `loop` starts from the plant alone, "
             "so leave `use` out of [effects]"
         )
+    study = with_least_terms(study)
     kinds = offered(study) if library is None else list(library)
     with (
         Progress(total=0, unit="task", quiet=quiet, desc="fitting the plant without effects") as bar,
@@ -89,7 +97,7 @@ def _looped(study: Study, kinds: Sequence[type[Effect]], options: _Options) -> L
     if not begun.searchable:
         return begun.unexplained(obstacle)
     begun, searched = begun.search(options)
-    richer = beside_effects(begun.base, searched) if begun.chosen else None
+    richer = _richer(begun.base, searched) if begun.chosen else None
     if richer is not None:
         options.crew.stage("searching again with a richer plant")
         begun, searched = replace(begun, base=richer).search(options)
@@ -97,6 +105,11 @@ def _looped(study: Study, kinds: Sequence[type[Effect]], options: _Options) -> L
     if obstacle and too_smooth(searched.state.optimum):
         return begun.unexplained(obstacle)
     return _Judged.of(begun, searched, options.crew).sampled(options)
+
+
+def _richer(base: Base, searched: Search) -> Base | None:
+    """The richer base model that effects or unseen records ask for; None without any."""
+    return beside_effects(base, searched) or beside_unseen(base, searched)
 
 
 @final

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
 
@@ -198,20 +198,24 @@ def by_search(
 ) -> Run | None:
     """The importance draws that `sample` begins with, of every axis by itself where axes share nothing; None
     where no search is possible or gives any. `optima`, one or more, and `rough` as there; the time of the
-    plan runs from `begin` (`time.monotonic`), by default from now."""
+    plan runs from `begin` (`time.monotonic`), by default from now. One axis of several has its share of what
+    is left, and where that is not enough no other is searched: all of them would take longer."""
     begin, unfinished = monotonic() if begin is None else begin, False
     rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
-    left = partial(_left, plan, begin)
+    axes = len(posterior.table.layout.responses)
 
     def drawn(factor: Posterior, own: Sequence[Optimum]) -> Weighted | None:
-        nonlocal unfinished
+        nonlocal unfinished, axes
         if not (applies(factor) and _mapped(factor)):
             return None
+        others = 0 if factor is posterior else axes - 1
+        axes, share = others, _left(plan, begin) / (1 + others)
+        left = partial(_left, replace(plan, seconds=share if isfinite(share) else None), monotonic())
         alone, wider = replace(plan, seed=int(rng.integers(2**31))), rough if factor is posterior else None
         with workers(factor, jobs=jobs) as crew, _points(quiet=True) as bar:
             search, weighted = _searched(factor, alone, crew, jobs, bar, own, wider, left)
         unfinished |= search.unfinished
-        return weighted
+        return None if search.unfinished and others else weighted
 
     weighted = importance_by_axis(posterior, optima, drawn, plan.delivered, rng)
     if weighted is None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling import sampler
+from lcopa_bayes.sampling import sampler, separateaxes
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
 from lcopa_bayes.sampling.marginal import Search
@@ -101,6 +103,34 @@ def test_draws_from_the_optima_of_the_whole_are_made_axis_by_axis_too(
     assert found.weighted is not None
     assert len(found.weighted.factors) == 2
     agree(whole, run, found)
+
+
+def test_an_axis_that_takes_more_than_its_share_ends_a_search_with_a_budget(
+    whole: Posterior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the time for the first of two; all that is left for the second, whose draws count though its
+    time was not enough."""
+    shares = list[float]()
+    drawn = SimpleNamespace(factors=(), ess=1.0)
+
+    def searched(*given: Any) -> tuple[SimpleNamespace, SimpleNamespace]:
+        shares.append(given[-1]())
+        return SimpleNamespace(unfinished=late[len(shares) - 1]), drawn
+
+    def joined(*given: Any) -> SimpleNamespace:
+        return drawn
+
+    monkeypatch.setattr(sampler, "_searched", searched)
+    monkeypatch.setattr(separateaxes, "joined", joined)
+    optima = find_optima(whole, np.random.default_rng(6), starts=1)
+    budget = replace(plan(5), seconds=100.0)
+    for late, expected in (([True, False], [50.0]), ([False, True], [50.0, 100.0])):
+        shares.clear()
+        found = by_search(whole, budget, optima)
+        assert shares == pytest.approx(expected, abs=5.0)
+        assert (found is None) == late[0]
+    assert found is not None
+    assert found.stopped_after is not None
 
 
 def agree(whole: Posterior, run: Run, other: Run) -> None:
