@@ -70,10 +70,10 @@ def loop(
 ) -> Loop:
     """Trace what a study's base model lacks; deterministic given the study's seed.
 
-    Unless `as_stated`, a study of one viscous term or of "auto" gets as many as the evidence asks for. Without
-    `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
-    are drawn and ensembles are half as long. Unless `quiet` it says on standard error what it does and what
-    it knows by then. InputError when the study does not fit its records, or uses effects already.
+    Unless `as_stated`, a study of one viscous term or of "auto" gets as many as the evidence asks for.
+    Without `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance
+    residuals are drawn and ensembles are half as long. Unless `quiet` it says on standard error what it does
+    and what it knows by then. InputError when the study does not fit its records, or uses effects already.
     """
     if study.effects.use:
         raise InputError(
