@@ -123,22 +123,20 @@ class State:
 
     @cached_property
     def band_scales(self) -> tuple[BandScales | None, ...]:
-        """Those of the bands of each axis; None where the noise is known, or the bands hold what remains."""
+        """Those of the bands of each axis; None where the noise is known, if only as that of what remains."""
         none = (None,) * len(self.whitening.noise)
-        if self.widening is not None:
-            return none
-        if self.sampled is not None:
+        if self.sampled is not None and self.widening is None:
             return tuple(_sampled_scales(*self.sampled, axis) for axis in range(len(none)))
         return tuple(one.scales for one in self.residual_noise) if self.whitening.dependence else none
 
     @cached_property
     def stretches(self) -> Array | None:
         """What turns deviations of the coordinates from the optimum into those under noise that the residual
-        leaves plausible, (draws, k, k) [-]; None where the noise is known, or that of what remains.
+        leaves plausible, (draws, k, k) [-]; None where the noise is known.
 
         Their covariance is the sandwich of White (1982, Econometrica 50).
         """
-        if not self.whitening.dependence or self.widening is not None:
+        if not self.whitening.dependence:
             return None
         at, sd = self.optimum, self.optimum.sd
         unit = np.where(sd > 0.0, sd, 1.0)  # no result depends on the units

@@ -9,11 +9,13 @@ from test_loop_noise import scales
 from test_loop_unseen import SD, campaign, fitted
 
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
 from lcopa_bayes.effectsearch.heldoutscores import _about_optimum
 from lcopa_bayes.effectsearch.noise import joint_noise
 from lcopa_bayes.effectsearch.noiselaw import Law, plausible, plausible_in_residual
 from lcopa_bayes.effectsearch.residualnoise import BandScales, ResidualNoise, _tails
+from lcopa_bayes.effectsearch.scores import fit_scores
 from lcopa_bayes.inference.noise import AR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise
 
@@ -196,3 +198,17 @@ def test_bands_of_draws_hold_their_own_noise():
     (scales,) = replace(state, sampled=sampled).band_scales
     assert scales.noise == pytest.approx(1.5 * state.whitening.noise[0].sd, rel=0.02)
     assert scales.prediction == 1.0
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_bands_that_hold_what_remains_are_no_narrower(sampled: bool):
+    """Of a residual that alone tells the noise they had its own scale, and held half of what they should."""
+    _, state = fitted(campaign("coloured", 1))
+    state = replace(state, whitening=replace(state.whitening, dependence=(1.0,)))
+    excess = Widening.of(state.whitening.samples, state.optimum.residual, state.whitening.noise)
+    drawn = _about_optimum(state, 1) if sampled else None
+    plain, wide = state, replace(state, widening=excess, sampled=drawn)
+    assert fit_scores(plain)[0].scales is not None
+    for narrow, wider in zip(fit_scores(plain), fit_scores(wide), strict=True):
+        assert (wider.half_width >= (1 - 1e-12) * narrow.half_width).all()
+    np.testing.assert_array_equal(wide.stretches, plain.stretches)
