@@ -40,7 +40,8 @@ SOFT = -50.0
 def stiff(**settings: object) -> Study:
     command = staircase([1.0, -0.7, 0.0], hold=2.0, start=0.55)
     one = record(command=command, camera=0.5, duration=6.5, name="r0")
-    return with_effect(study(one, noise="white", seed=4, **settings), ["cubic_stiffness"], TRUTH)[0]
+    base = study(one, noise="white", seed=4, blocks=60, **settings)
+    return with_effect(base, ["cubic_stiffness"], TRUTH)[0]
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from test_loop import LIBRARY, study
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import NoiseSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch import explained
@@ -42,9 +43,15 @@ from lcopa_bayes.sampling.run import SamplePlan
 loops = sys.modules[loop.__module__]
 
 
+def short(seed: int, **changes: float) -> Study:
+    """Of two fitted records."""
+    made = study(seed, **changes)
+    return replace(made, fit=made.fit[:2])
+
+
 @pytest.fixture(scope="module")
 def bent() -> Loop:
-    return loop(study(1, curvature=0.08), library=LIBRARY, quick=True, as_stated=True)
+    return loop(short(1, curvature=0.08), library=LIBRARY, quick=True, as_stated=True)
 
 
 @pytest.fixture(scope="module")
@@ -201,9 +208,7 @@ def test_a_plant_without_effects_is_searched_where_a_first_proposal_is_not_close
     monkeypatch.setattr(
         explained, "by_search", lambda *a, **how: given.append(search(*a, **how)) or given[-1]
     )
-    made = study(1)
-    made = replace(made, fit=made.fit[:2])
-    draws, _ = explained_draws(made, lambda draws, noise: True, quick=True)
+    draws, _ = explained_draws(short(1), lambda draws, noise: True, quick=True)
     assert len(given) == searches
     assert draws.grade.level == "reliable"
     own = found[0][1]
@@ -238,7 +243,7 @@ def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated
 
 def test_time_that_has_run_out_ends_what_is_tried_next():
     """Of 100 s that began 99.9 s ago next to nothing is left: fewer draws than otherwise, and limited."""
-    posterior = problem_of(study(1)).posterior
+    posterior = problem_of(short(1)).posterior
     plan = SamplePlan.of(posterior.dimension, seed=3, seconds=100.0)
     optima = find_optima(posterior, np.random.default_rng(1), starts=1)
     late = explained.by_search(posterior, plan, optima, begin=monotonic() - 99.9)
@@ -253,10 +258,10 @@ def test_noise_that_is_not_gaussian_is_not_searched(monkeypatch):
     """A search of a campaign under Student's noise took five minutes where one proposal takes ten seconds."""
     monkeypatch.setattr(explained, "weighted_run", lambda *given, **how: None)
     monkeypatch.setattr(explained, "by_search", None)  # a call of it would raise
-    one = replace(study(1), noise=NoiseSettings("student"))
+    one = replace(short(1), noise=NoiseSettings("student"))
     assert explained_draws(one, lambda draws, noise: True, quick=True) is None
     with pytest.raises(TypeError):
-        explained_draws(study(1), lambda draws, noise: True, quick=True)
+        explained_draws(short(1), lambda draws, noise: True, quick=True)
 
 
 def test_many_samples_are_not_searched_and_have_one_proposal(monkeypatch):
@@ -291,8 +296,7 @@ def test_what_is_explained_already_is_refused(bent: Loop):
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the command line, of a smaller catalogue."""
     folder = tmp_path_factory.mktemp("made")
-    source = study(2, curvature=0.08, held_out=1)
-    source = replace(source, fit=source.fit[:2])
+    source = short(2, curvature=0.08)
     (folder / "in").mkdir()
     write_study(replace(source, name="made"), folder / "in" / "study.toml")
     arguments = ["loop", str(folder / "in"), "--out", str(folder / "run"), "--quick", "--jobs", "1"]

@@ -89,7 +89,7 @@ def test_an_effect_of_the_user_is_searched_in_this_process(pools, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     made = replace(study(2, 0.06), folder=tmp_path, effects=EffectsSettings(add=("own.py:Cubed",)))
     made = replace(made, fit=made.fit[:2])
-    library = [catalogue(["own.py:Cubed"], tmp_path)["cubed"], LIBRARY[1], LIBRARY[2]]
+    library = [catalogue(["own.py:Cubed"], tmp_path)["cubed"], LIBRARY[1]]
     one, two = (
         loop(made, library=library, jobs=jobs, sample=False, quick=True, as_stated=True) for jobs in (1, 2)
     )

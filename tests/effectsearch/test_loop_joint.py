@@ -54,7 +54,7 @@ def fitted(study):
 @cache
 def away():
     """A study whose records began away from rest, and its fit."""
-    study = study_of(3.5)
+    study = study_of(3.5, n=300)
     return study, fitted(study)
 
 
@@ -69,7 +69,7 @@ def test_a_start_away_from_rest_is_found():
 
 
 def test_a_start_at_rest_or_a_stated_one_is_left_alone():
-    resting = study_of(float(walked("a", 0.0, 1).drive[0, 0]))
+    resting = study_of(float(walked("a", 0.0, 1, n=300).drive[0, 0]), n=300)
     assert started(resting, fitted(resting)) is None
     made = started(*away())
     assert started(made.study, fitted(made.study)) is None
@@ -115,7 +115,7 @@ def test_a_residual_without_independent_samples_names_nothing():
 
 def test_chance_residuals_are_judged_as_the_residual_is():
     """Beside tangents as weak as their priors: what these leave of a chance residual, and its power."""
-    fit = fitted(study_of(3.5))
+    _, fit = away()
     white = Whitening(fit.regression.whitening.samples, fit.regression.whitening.noise)
     along = np.ones((white.size, 1)) / np.sqrt(white.size)
     project = Projection(0.7 * along)

@@ -55,9 +55,9 @@ def multisine(name, seed, n, *, cubic=CUBIC, size=0.022, read_from=0):
     return Record(name, np.arange(n) * PERIOD, drive[:, None], response[:, None], AXIS, AXIS, "ms")
 
 
-def study_of(terms, **more):
+def study_of(terms, *, n=800, read_from=200, **more):
     fit, other = (
-        multisine(name, seed, 800, read_from=200, **more) for name, seed in (("fit", 1), ("other", 2))
+        multisine(name, seed, n, read_from=read_from, **more) for name, seed in (("fit", 1), ("other", 2))
     )
     return Study("spring", None, "ms", 3, (fit,), (other,), ModelSettings(terms=terms))
 
@@ -90,7 +90,7 @@ def test_a_cubic_spring_is_named_beside_a_drive_that_was_sampled():
     remains is above the noise, so that not all may be explained."""
     names = ("sampled_drive", "cubic_stiffness", "unmodelled_linear")
     library = [catalogue()[name] for name in names]
-    found = loop(study_of(1), library=library, sample=False, quick=True, as_stated=True)
+    found = loop(study_of(1, n=400, read_from=100), library=library, sample=False, quick=True, as_stated=True)
     assert {effect.name for effect in found.effects} == {"sampled_drive", "cubic_stiffness"}
     assert found.verdict.kind in ("explained", "partly explained")
     assert found.after.fit[0].rmse > 1.5 * NOISE

@@ -55,6 +55,12 @@ def test_noise_that_few_samples_at_rest_leave_open_is_that_of_the_residual():
     assert law.share * law.rho == pytest.approx(0.6, abs=0.1)
 
 
+def bent():
+    """Two records of a bent reading."""
+    made = study(2, BENT)
+    return replace(made, fit=made.fit[:2])
+
+
 @pytest.fixture(scope="module")
 def pulsed():
     """A base fit with a pulse after every change, of a length that is not known."""
@@ -108,7 +114,7 @@ def test_an_effect_of_several_instances_is_worth_what_its_refit_is(pulsed):
 
 def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
     """By a refit that adds it to the plant with the other."""
-    made = study(2, 0.06)
+    made = bent()
     base = fitted_base(made, LIBRARY, as_stated=True, draws=400).start
     odd, even = (catalogue()[name]() for name in ("odd_curvature", "even_curvature"))
     one = refit(base.model, base.optimum, base.whitening, [(even, np.zeros(1))], 1e3)
@@ -121,7 +127,7 @@ def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
 
 def test_each_of_a_pair_has_the_names_that_may_stand_for_it_beside_the_other():
     """A twin of the one under another name, and none of the other; alone each confounds both."""
-    made = study(2, 0.06)
+    made = bent()
     made = replace(
         made, fit=tuple(replace(one, response=one.response + BENT * one.response**2) for one in made.fit)
     )
@@ -155,7 +161,7 @@ def test_another_instance_is_one_of_another_signature():
 
 
 def test_names_are_firm_where_each_brought_enough_and_nothing_remains():
-    made = study(2, 0.06)
+    made = bent()
     base = fitted_base(made, LIBRARY, as_stated=True, draws=400)
     found = search(
         base.start, LIBRARY, np.random.default_rng(0), noise_samples=base.fit.noise_samples, draws=400

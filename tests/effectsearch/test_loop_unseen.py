@@ -231,6 +231,7 @@ def test_an_effect_of_single_records_is_named_though_unseen_records_have_others(
     assert (found.verdict.kind, found.names) == ("disturbance", ("trigger_jitter",))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="measured records are absent; set LCOPA_BAYES_DATA")
 def test_a_measured_plant_that_is_missed_is_not_clean():
     """A thermal plant whose fit leaves 1.3 degC, and whose other half is missed by 2.8 times that."""
@@ -241,6 +242,7 @@ def test_a_measured_plant_that_is_missed_is_not_clean():
     assert found.before.unseen[0].rmse > 2 * found.before.fit[0].rmse
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="measured records are absent; set LCOPA_BAYES_DATA")
 def test_effects_known_from_one_part_are_judged_by_fits_without_it():
     """By the linear step the delay moves by 160 standard deviations without the part of the onset, and the

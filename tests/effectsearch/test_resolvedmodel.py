@@ -68,9 +68,8 @@ def test_an_effect_has_the_blocks_that_it_asks_for(wide):
 
 
 def test_a_loop_ends_on_the_blocks_that_its_effects_ask_for():
-    records = [asymmetric(1, [1.0, -0.7, 0.4, 0.0]), asymmetric(2, [-0.6, 0.9, -1.0, 0.5])]
-    unseen = asymmetric(3, [0.8, -1.0, 0.2, 0.9])
-    own = study(*records, held_out=[unseen], blocks=100)
+    seen, unseen = asymmetric(1, [1.0, -0.7, 0.4, 0.0]), asymmetric(3, [0.8, -1.0, 0.2, 0.9])
+    own = study(seen, held_out=[unseen], blocks=100)
     found = loop(own, library=[RiseFallAsymmetry], sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "explained"
     assert found.problem.refinement > 1

@@ -325,7 +325,7 @@ def test_a_whole_run_samples_a_known_posterior(seed):
     fixed = {name: TRUTH[name] for name in ("time_1", "order_1", "delay", "offset")} | {"sigma": 0.3}
     posterior = problem(record(camera=0.6, noise_sd=0.3), priors=fixed | {"gain": GAIN}).posterior
     mean, sd = exact_gain(posterior)
-    ensembles, target = (4, 500) if seed else (2, 300)
+    ensembles, target = (4, 500) if seed else (2, 100)
     run = sample(
         posterior,
         SamplePlan.of(1, seed=seed, ensembles=ensembles, walkers=16, thin=4, target_ess=target),
