@@ -2,7 +2,7 @@
 
 Files of `corpus`, and tables, workbooks and run folders made here, are cut, spliced and encoded anew.
 No other exception and no warning may come of it, and no input may take longer than `MOST`. The environment
-variable LCOPA_BAYES_FUZZ is the number of inputs in all, such as 20000 or 1000000; above the default they are
+variable LCOPA_BAYES_FUZZ is the number of inputs in all, such as 20000 or 1000000; above `REPEATED` they are
 new ones in every run. LCOPA_BAYES_FUZZ_SUMMARY is a file for what came of them, as
 `studies/robustness/fuzz.py` reports it.
 """
@@ -16,6 +16,8 @@ import re
 import resource
 import shutil
 import signal
+import subprocess
+import sys
 import time
 import warnings
 from collections import defaultdict
@@ -45,8 +47,9 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # xarray leaves files open
 ]
 CORPUS = Path(__file__).parent / "corpus"
-DEFAULT = 4_000
-INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", DEFAULT))
+REPEATED = 4_000
+"""Most inputs that are the same in every run."""
+INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", REPEATED // 4))
 MOST = 5.0
 """Longest time that one input may take [s]."""
 SEEN: dict[str, dict[str, float]] = defaultdict(lambda: {"inputs": 0, "refused": 0, "longest": 0.0})
@@ -208,7 +211,7 @@ def many(share: float, *, least: int = 1) -> Callable[[Callable], Callable]:
         max_examples=max(least, int(share * INPUTS)),
         deadline=None,  # `refused_or` has its own, which a reader that hangs does not outlast
         database=None,
-        derandomize=INPUTS <= DEFAULT,
+        derandomize=INPUTS <= REPEATED,
         suppress_health_check=list(HealthCheck),
     )
 
@@ -394,3 +397,13 @@ def test_values_of_a_fit(run, place, data):
     (folder / "fit.json").write_text(json.dumps(values))
     with refusing():
         load_result(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("LCOPA_BAYES_FUZZ" in os.environ, reason="the number of inputs is stated")
+def test_all_repeated_inputs():
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "not slow", "-p", "no:cacheprovider"]
+    environment = os.environ | {"LCOPA_BAYES_FUZZ": str(REPEATED)}
+    root = Path(__file__).parents[2]
+    done = subprocess.run([*command, __file__], env=environment, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

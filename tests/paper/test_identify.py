@@ -328,8 +328,10 @@ def test_a_hundred_thousand_candidates_in_a_minute():
 # -- under noise -----------------------------------------------------------------------------------
 
 
-def test_the_equation_error_is_biased_and_the_output_error_is_not():
-    replicas, wide = 48, []
+@pytest.mark.parametrize("fitted", [16, pytest.param(48, marks=pytest.mark.slow)])
+def test_the_equation_error_is_biased_and_the_output_error_is_not(fitted):
+    """The output error is fitted to the first replicas alone, as a fit takes a hundred times as long."""
+    replicas, wide = 48, np.full((48, 3, 3), np.nan)
     for seed in range(replicas):
         noisy = record(seed, device=DEVICE, command=step(1.0, at=3.0), camera=0.1, noise_sd=0.012)
         once = study(noisy, terms=2)
@@ -337,13 +339,16 @@ def test_the_equation_error_is_biased_and_the_output_error_is_not():
         rough, last = (
             least_squares(blocks_of(data), ORDERS, DELAY, normalisation=each) for each in Normalisation
         )
-        rng = np.random.default_rng(seed)
-        fine = output_error_fit(once, data, rng, terms=2, orders=ORDERS, start=TRUE, starts=1)
-        forms = [model.normalised(Normalisation.STIFFNESS, 1.0) for model in (rough, last, fine)]
-        wide.append([[*form.etas, form.gain] for form in forms])
-        assert output_rmse(data.records, fine) <= output_rmse(data.records, rough)
-    relative = np.array(wide) / [*ETAS, GAIN] - 1
-    mean, error = relative.mean(axis=0), relative.std(axis=0, ddof=1) / np.sqrt(replicas)
+        found = [rough, last]
+        if seed < fitted:
+            rng = np.random.default_rng(seed)
+            fine = output_error_fit(once, data, rng, terms=2, orders=ORDERS, start=TRUE, starts=1)
+            assert output_rmse(data.records, fine) <= output_rmse(data.records, rough)
+            found.append(fine)
+        forms = [model.normalised(Normalisation.STIFFNESS, 1.0) for model in found]
+        wide[seed, : len(forms)] = [[*form.etas, form.gain] for form in forms]
+    relative, count = wide / [*ETAS, GAIN] - 1, np.array([[replicas], [replicas], [fitted]])
+    mean, error = np.nanmean(relative, axis=0), np.nanstd(relative, axis=0, ddof=1) / np.sqrt(count)
     assert mean[0, 0] < -4.5 * error[0, 0]  # attenuated, as a regressor with noise is
     assert (mean[1, 1:] > 4.5 * error[1, 1:]).all()
     assert (np.abs(mean[2]) < 3.5 * error[2] + 0.01).all()

@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "studies" / "robustness"))
 import spoiled
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 
 
 def test_spoiled_records_have_the_size_and_the_units_that_are_asked_for():
@@ -29,9 +31,25 @@ def test_spoiled_records_have_the_size_and_the_units_that_are_asked_for():
     assert np.nanmax(np.ptp(np.nan_to_num(flat.response, nan=flat.response[0, 0]), axis=0)) == 0
 
 
+BRIEF = {"model": ModelSettings(terms=1), "noise": NoiseSettings("white")}
+"""What a study states that is to be fitted in half the time."""
+
+
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("verb", spoiled.VERBS)
-def test_a_campaign_ends_in_a_result(monkeypatch, verb):
+@pytest.mark.parametrize(
+    ("verb", "stated"),
+    [
+        *(
+            pytest.param(verb, {}, id=verb, marks=[pytest.mark.slow] * (verb == "fit"))
+            for verb in spoiled.VERBS
+        ),
+        pytest.param("fit", BRIEF, id="short fit"),
+    ],
+)
+def test_a_campaign_ends_in_a_result(monkeypatch, verb, stated):
+    """With more of it `stated` than the campaign does, where a verb takes long."""
+    own, said = spoiled.study(405)
+    monkeypatch.setattr(spoiled, "study", lambda seed: (replace(own, **stated), said))
     monkeypatch.setattr(spoiled, "DRAWING", 1.0)
     row = spoiled.play((verb, 120), 405)
     assert row["outcome"] in spoiled.RESULTS[verb]
