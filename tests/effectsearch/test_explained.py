@@ -8,19 +8,26 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import small
+from small import path, record
 from test_loop import LIBRARY, study
 
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import NoiseSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch import explained
 from lcopa_bayes.effectsearch.explained import (
+    _sampled,
     constant_about,
     coordinates_of,
     explained_draws,
@@ -239,6 +246,29 @@ def test_draws_have_little_time_unless_the_study_states_more(monkeypatch, stated
     assert explained_draws(own, lambda draws, noise: True, quick=True) is None
     assert [plan.seconds for plan in plans] == [stated or limit] * ways
     assert len(set(begun)) == 1
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_a_search_that_one_axis_ended_counts_for_every_axis(monkeypatch, axes: int):
+    """The others would have taken as long: what is tried next has the rest, and says when it really ended."""
+    clock, given = [0.0], list[tuple[float, float]]()
+
+    def searched(*_, **how) -> None:
+        clock[0] += 40.0
+
+    def around(posterior, plan: SamplePlan, *, begin: float, **how) -> None:
+        given.append((plan.seconds, begin))
+
+    monkeypatch.setattr(explained, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(explained, "by_search", searched)
+    monkeypatch.setattr(explained, "weighted_run", around)
+    one = path(1.0, 0.3, (1.2,), (0.9,))
+    responses = (Axis("x", "rad"), Axis("y", "rad"))[:axes]
+    device = Device(((one,),) * axes, (Axis("u", "V"),), responses, (0.0,) * axes)
+    problem = problem_of(small.study(record(device=device, command=on_off([1.0], hold=5.0))))
+    start = SimpleNamespace(values=problem.posterior.table.draw(1, np.random.default_rng(0))[0])
+    assert _sampled(problem, [start], jobs=1, quick=True) is None
+    assert given == [(explained.LIMIT, 0.0), (explained.LIMIT - 40.0 * (axes - 1), 0.0)]
 
 
 def test_time_that_has_run_out_ends_what_is_tried_next():
