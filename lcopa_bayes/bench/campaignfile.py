@@ -5,6 +5,7 @@
     seed = 7
     [bench]                      # defaults: the paper's bench
     noise_sd = 1.8e-4
+    logged = false               # true: changes of the drive are written with the next sample
     [[path]]                     # defaults: the paper's four paths
     response = "x"
     drive = "x"
@@ -51,7 +52,7 @@ _PAIR = Rule("a list of two numbers", lambda value: _NUMBERS.holds(value) and le
 _EITHER = Rule("a number or a list of numbers", lambda value: is_number(value) or _NUMBERS.holds(value))
 _TEXTS = Rule("a list of texts", lambda value: isinstance(value, list) and all(map(_TEXT.holds, value)))
 _HEADING = {"name": _TEXT, "seed": whole(0)}
-_BENCH = {field.name: _NUMBER for field in fields(Bench)} | {"noise_sd": _EITHER}
+_BENCH = {field.name: _NUMBER for field in fields(Bench)} | {"noise_sd": _EITHER, "logged": FLAG}
 _PATH = {
     **{"response": _TEXT, "drive": _TEXT, "gain": _NUMBER, "delay": _NUMBER},
     **{"etas": _NUMBERS, "orders": _NUMBERS, "stiffness": _NUMBER},

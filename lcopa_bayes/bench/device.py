@@ -21,7 +21,7 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.inversion import unit_ramp, unit_step, unsuited
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.core.rules import POSITIVE, Rule, Ruled, is_number
+from lcopa_bayes.core.rules import FLAG, POSITIVE, Rule, Ruled, is_number
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
@@ -232,6 +232,9 @@ class Bench(Ruled):
     """Stationary standard deviation of a sample [response unit], one for all response axes or one each."""
     noise_correlation: Annotated[float, _CORRELATION] = 0.0
     """rho [-], correlation of successive camera samples (AR(1)); 0: white. Axes are independent."""
+    logged: Annotated[bool, FLAG] = False
+    """Whether changes of the drive are written with the next camera sample, up to a period late, as many
+    loggers do, not at the instants of the commands."""
 
     def contradictions(self) -> list[str]:
         """An exposure longer than the camera period."""
@@ -273,9 +276,9 @@ def truth(
 
     Rows: one before everything, a camera period before time 0 or before the first change if that is
     earlier, with the resting drive and no response; the camera samples ``0, camera, 2 camera, ...``
-    below `duration` [ms]; and, wherever the command changes between samples, a row at that instant
-    without a response. The drive column is the drive as commanded: the refresh is the device's
-    business. Raises InputError for a duration that holds no sample.
+    below `duration` [ms]; and, wherever the command changes between samples and is not `logged` with them,
+    a row at that instant without a response. The drive column is the drive as commanded: the refresh is the
+    device's business. Raises InputError for a duration that holds no sample.
     """
     if not bench.camera <= duration < inf:
         raise InputError(f"`duration` must be finite and at least a camera period; got {duration}")
@@ -283,7 +286,7 @@ def truth(
     changes = command.times[command.times < duration - _SAME * bench.camera]
     nearest = bench.camera * np.round(changes / bench.camera)
     apart = (np.abs(changes - nearest) > _SAME * bench.camera) | (nearest < -_SAME)
-    time = np.union1d(camera, changes[apart])
+    time = np.union1d(camera, changes[apart & (changes < 0.0)] if bench.logged else changes[apart])
     time = np.insert(time, 0, _rounded(time[:1] - bench.camera))
     drive = command.at(time + _SAME * bench.camera)
 

@@ -442,6 +442,19 @@ def test_a_change_at_a_sample_in_another_rounding_is_at_that_sample():
     assert_array_equal(record.drive[:, 0], 8 * [0.0] + 3 * [1.0])
 
 
+def test_changes_logged_with_samples_are_late_and_act_when_they_did():
+    command = step(1.0, at=0.234)
+    at_once, logged = Bench(), Bench(logged=True)
+    prompt, late = (truth(single(XX), one, command, duration=2.0, name="r") for one in (at_once, logged))
+    seen = np.isfinite(prompt.response[:, 0])
+    assert_array_equal(late.time, prompt.time[seen | (np.arange(seen.size) == 0)])
+    assert_array_equal(late.drive[:, 0], np.where(late.time >= 0.3, 1.0, 0.0))
+    assert_array_equal(late.response[1:], prompt.response[seen])
+    early = truth(single(XX), logged, step(1.0, at=-0.35), duration=1.0, name="r")
+    assert_allclose(early.time[1], -0.35)
+    assert early.drive[1, 0] == 1.0
+
+
 def test_refresh_delays_the_response_but_not_the_log():
     at_once, held = Bench(), Bench(refresh=1.0)
     device = single(XX)
@@ -478,6 +491,7 @@ def test_simulated_is_truth_plus_seeded_noise():
         {"noise_sd": (0.1, -0.1)},
         {"noise_sd": float("nan")},
         {"noise_correlation": 1.0},
+        {"logged": "yes"},
     ],
 )
 def test_bad_benches_are_refused(change):
