@@ -58,7 +58,7 @@ def short(seed: int, **changes: float) -> Study:
 
 @pytest.fixture(scope="module")
 def bent() -> Loop:
-    return loop(short(1, curvature=0.08), library=LIBRARY, quick=True, as_stated=True)
+    return loop(study(1, curvature=0.08), library=LIBRARY, quick=True, as_stated=True)
 
 
 @pytest.fixture(scope="module")

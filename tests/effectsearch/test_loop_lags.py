@@ -34,7 +34,7 @@ def risen(time: Vector, times: Vector = TIMES) -> Vector:
 
 def record(name: str, levels: list[float], seed: int, times: Vector = TIMES, limit: float = np.inf) -> Record:
     rng = np.random.default_rng(seed)
-    time, at = np.arange(0.0, 500.0, 2.0), 30.0 + 110.0 * np.arange(len(levels))
+    time, at = np.arange(500.0), 30.0 + 110.0 * np.arange(len(levels))
     drive = np.concatenate([[0.0], levels])[np.searchsorted(at, time, side="right")]
     jumps = np.diff([0.0, *levels])
     response = GAIN * sum(jump * risen(time - start, times) for jump, start in zip(jumps, at, strict=True))
