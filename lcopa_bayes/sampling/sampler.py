@@ -202,20 +202,20 @@ def by_search(
     is left, and where that is not enough no other is searched: all of them would take longer."""
     begin, unfinished = monotonic() if begin is None else begin, False
     rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
-    axes = len(posterior.table.layout.responses)
+    waiting = len(posterior.table.layout.responses)
 
     def drawn(factor: Posterior, own: Sequence[Optimum]) -> Weighted | None:
-        nonlocal unfinished, axes
+        nonlocal unfinished, waiting
         if not (applies(factor) and _mapped(factor)):
             return None
-        others = 0 if factor is posterior else axes - 1
-        axes, share = others, _left(plan, begin) / (1 + others)
+        waiting = 0 if factor is posterior else waiting - 1
+        share = _left(plan, begin) / (1 + waiting)
         left = partial(_left, replace(plan, seconds=share if isfinite(share) else None), monotonic())
         alone, wider = replace(plan, seed=int(rng.integers(2**31))), rough if factor is posterior else None
         with workers(factor, jobs=jobs) as crew, _points(quiet=True) as bar:
             search, weighted = _searched(factor, alone, crew, jobs, bar, own, wider, left)
         unfinished |= search.unfinished
-        return None if search.unfinished and others else weighted
+        return None if search.unfinished and waiting else weighted
 
     weighted = importance_by_axis(posterior, optima, drawn, plan.delivered, rng)
     if weighted is None:
