@@ -197,7 +197,7 @@ def beside_unseen(base: Base, searched: Search) -> Base | None:
 
     Fitted records may not show a term that another drive shows: what they leave open, others decide.
     """
-    if searched.state.model.effects or searched.rounds[-1].alarmed:
+    if not base.richer or searched.state.model.effects or searched.rounds[-1].alarmed:
         return None
     own = _missed(base, searched.state)
     if own is None or not own.significant:

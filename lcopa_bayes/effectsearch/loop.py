@@ -97,7 +97,9 @@ def _looped(study: Study, kinds: Sequence[type[Effect]], options: _Options) -> L
     if not begun.searchable:
         return begun.unexplained(obstacle)
     begun, searched = begun.search(options)
-    richer = _richer(begun.base, searched) if begun.chosen else None
+    richer = None
+    if begun.chosen:  # effects or unseen records may ask for it
+        richer = beside_effects(begun.base, searched) or beside_unseen(begun.base, searched)
     if richer is not None:
         options.crew.stage("searching again with a richer plant")
         begun, searched = replace(begun, base=richer).search(options)
@@ -105,11 +107,6 @@ def _looped(study: Study, kinds: Sequence[type[Effect]], options: _Options) -> L
     if obstacle and too_smooth(searched.state.optimum):
         return begun.unexplained(obstacle)
     return _Judged.of(begun, searched, options.crew).sampled(options)
-
-
-def _richer(base: Base, searched: Search) -> Base | None:
-    """The richer base model that effects or unseen records ask for; None without any."""
-    return beside_effects(base, searched) or beside_unseen(base, searched)
 
 
 @final

@@ -133,11 +133,10 @@ class Loop:
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""
         row = self._row(k)
-        drawn = self._mixture
-        having = [number for number, part in enumerate(drawn.parts) if k < part.shape[1]]
-        values, shares = [row.value_at(drawn.parts[one][:, k]) for one in having], drawn.weights[having]
-        rivals = tuple(place for place, one in enumerate(having) if one in drawn.rivals)
-        number = Weighed(row.name, row.unit, values, shares / shares.sum(), rivals=rivals)
+        having = [place for place, part in enumerate(self._mixture.parts) if k < part.shape[1]]
+        parts, weights, rivals = self._mixture.only(having)
+        values = [row.value_at(part[:, k]) for part in parts]
+        number = Weighed(row.name, row.unit, values, weights, rivals=rivals)
         number = self.plants.number(number, row)
         return number_with_lags(number, row, self.lags, self.after.state.model.plant.table.layout)
 

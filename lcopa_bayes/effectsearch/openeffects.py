@@ -127,6 +127,12 @@ class Mixture(NamedTuple):
     rivals: tuple[int, ...] = ()
     """Parts that have another effect in place of one of the final model."""
 
+    def only(self, places: Sequence[int]) -> Mixture:
+        """Its parts at these places."""
+        weights = self.weights[list(places)]
+        rivals = tuple(new for new, old in enumerate(places) if old in self.rivals)
+        return Mixture([self.parts[one] for one in places], weights / weights.sum(), rivals)
+
 
 def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> Mixture:
     """Draws of the final model, `own` or else those about its optimum that follow the records, and of each
@@ -202,25 +208,19 @@ def step_figures(state: State, drawn: Mixture, *, span: float, time_unit: str) -
     draws of a mixture; none where no draw of the final model is a plant."""
     model = state.model
     table = model.plant.table
-    kept: list[Matrix] = []
-    shares: list[float] = []
-    rivals: list[int] = []
-    for number, (part, weight) in enumerate(zip(drawn.parts, drawn.weights, strict=True)):
+    values = []
+    for part, weight in zip(drawn.parts, drawn.weights, strict=True):
         count = min(max(round(_RESPONSES * weight), _FEWEST), len(part))
-        values = model.plants(part[np.linspace(0, len(part) - 1, count).astype(int)])
-        values = values[table.supported(values)]
-        if not len(values) and not kept:
-            return ()
-        if len(values):
-            rivals += [len(kept)] if number in drawn.rivals else []
-            kept.append(values)
-            shares.append(weight)
-    every, ends = np.concatenate(kept), np.cumsum([len(one) for one in kept])[:-1]
+        plants = model.plants(part[np.linspace(0, len(part) - 1, count).astype(int)])
+        values.append(plants[table.supported(plants)])
+    if not len(values[0]):
+        return ()
+    kept = [number for number, one in enumerate(values) if len(one)]
+    every, ends = np.concatenate(values), np.cumsum([len(values[number]) for number in kept])[:-1]
+    _, weights, rivals = drawn.only(kept)
     found = metrics_of(table, curves_of(table, every, span), time_unit=time_unit)
-    share = np.array(shares) / sum(shares)
     return tuple(
-        Weighed(one.name, one.unit, np.split(one.values, ends), share, one.note, tuple(rivals))
-        for one in found
+        Weighed(one.name, one.unit, np.split(one.values, ends), weights, one.note, rivals) for one in found
     )
 
 

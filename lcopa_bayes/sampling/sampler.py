@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from math import inf, isfinite
+from math import inf
 from pathlib import Path
 from time import monotonic
 
@@ -202,20 +202,19 @@ def by_search(
     is left, and where that is not enough no other is searched: all of them would take longer."""
     begin, unfinished = monotonic() if begin is None else begin, False
     rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(1_003,)))
-    waiting = len(posterior.table.layout.responses)
 
-    def drawn(factor: Posterior, own: Sequence[Optimum]) -> Weighted | None:
-        nonlocal unfinished, waiting
+    def drawn(factor: Posterior, own: Sequence[Optimum], share: float) -> Weighted | None:
+        nonlocal unfinished
         if not (applies(factor) and _mapped(factor)):
             return None
-        waiting = 0 if factor is posterior else waiting - 1
-        share = _left(plan, begin) / (1 + waiting)
-        left = partial(_left, replace(plan, seconds=share if isfinite(share) else None), monotonic())
+        until = monotonic() + share * _left(plan, begin)
         alone, wider = replace(plan, seed=int(rng.integers(2**31))), rough if factor is posterior else None
         with workers(factor, jobs=jobs) as crew, _points(quiet=True) as bar:
-            search, weighted = _searched(factor, alone, crew, jobs, bar, own, wider, left)
+            search, weighted = _searched(
+                factor, alone, crew, jobs, bar, own, wider, lambda: until - monotonic()
+            )
         unfinished |= search.unfinished
-        return None if search.unfinished and waiting else weighted
+        return None if search.unfinished and share < 1.0 else weighted
 
     weighted = importance_by_axis(posterior, optima, drawn, plan.delivered, rng)
     if weighted is None:

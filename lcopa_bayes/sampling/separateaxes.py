@@ -59,19 +59,20 @@ def by_axis(
 def importance_by_axis(
     posterior: Posterior,
     optima: Sequence[Optimum],
-    drawn: Callable[[Posterior, Sequence[Optimum]], Weighted | None],
+    drawn: Callable[[Posterior, Sequence[Optimum], float], Weighted | None],
     count: int,
     rng: np.random.Generator,
 ) -> Weighted | None:
     """Importance draws from optima, one or more: `count` of each batch of all axes where these share nothing
-    and `drawn` gives some of every factor; else what that gives of the whole."""
+    and `drawn` gives some of every factor, in its share of the time that is left; else what that gives of the
+    whole."""
     factors, each = separated(posterior, optima[0].values), list[Weighted]()
-    for factor in factors:
-        weighted = drawn(factor, of_factor(factor, posterior, optima))
+    for number, factor in enumerate(factors):
+        weighted = drawn(factor, of_factor(factor, posterior, optima), 1 / (len(factors) - number))
         if weighted is None:
             return None
         each.append(weighted)
-    return joined(posterior, factors, each, count, rng) if factors else drawn(posterior, optima)
+    return joined(posterior, factors, each, count, rng) if factors else drawn(posterior, optima, 1.0)
 
 
 def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:

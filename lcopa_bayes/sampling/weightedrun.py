@@ -135,8 +135,10 @@ def _around(
     late: Callable[[], bool],
     posterior: Posterior,
     optima: Sequence[Optimum],
+    _: float,
 ) -> Weighted | None:
-    """Importance draws around optima; None where they are of no use."""
+    """Importance draws around optima; None where they are of no use. One axis of several has all the time
+    that is left."""
     tried = importance(posterior, optima, rng, wanted, mapped, late)
     return None if tried is None or not usable(tried.weighted) else tried.weighted
 
