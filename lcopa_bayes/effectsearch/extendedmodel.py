@@ -186,14 +186,28 @@ class ExtendedModel:
             values[:, k] = table.rows[k].value_at(x[:, position])
         return table.canonical(values)
 
+    @cached_property
+    def responding(self) -> tuple[ExtendedModel, list[int]]:
+        """The plant with its linear dynamics without a name, which are part of its response, and positions of
+        their coordinates among these."""
+        kept = [effect.card.dynamics for effect in self.effects]
+        own = [k for k, one in enumerate(self.effected.coefficients) if kept[one.effect]]
+        model = self.having(*(effect for effect in self.effects if effect.card.dynamics))
+        return model, [*range(self.plant_size), *(self.plant_size + k for k in own)]
+
     def supported(self, x: Matrix) -> Flags:
         """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,); terms that can
         be exchanged may be in any sequence."""
         return self.plant.table.supported(self.plants(x))
 
+    def tabulated(self, x: Matrix) -> Matrix:
+        """Table values at coordinates (batch, k), (batch, rows), terms in canonical order."""
+        rows = [self._least.values(one, self.template) for one in x]
+        return self.posterior.table.canonical(np.reshape(rows, (len(x), len(self.posterior.table.rows))))
+
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""
-        return np.asarray(self.posterior.table.canonical(self._least.values(x, self.template)[None])[0])
+        return np.asarray(self.tabulated(x[None])[0])
 
     def coordinates(self, values: Vector) -> Vector:
         """Coordinates of table values."""
@@ -244,7 +258,7 @@ class ExtendedModel:
         """Stacked responses at coordinates (batch, k), (batch, n) [response unit]; infinite where there are
         none."""
         posterior = self.posterior
-        values = posterior.table.canonical(np.array([self._least.values(x, self.template) for x in many]))
+        values = self.tabulated(many)
         units = posterior.responses(values)
         parts = [
             observed.values - posterior.residual(axis, r, observed, values, units[r])

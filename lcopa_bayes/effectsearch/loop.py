@@ -41,6 +41,7 @@ from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
 from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
 from lcopa_bayes.effectsearch.rounds import Search, search
 from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.unnameddynamics import UnnamedDynamics
 from lcopa_bayes.effectsearch.verdict import Verdict, beside, decide, widened
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.effect import Effect
@@ -303,7 +304,7 @@ class _Judged:
         )
         preferred = any(one.support == "lags" for one in lags)
         verdict = decide(replace(findings, linear=dynamics, preferred=preferred))
-        if verdict.kind == "unexplained" and extended and begun.chosen:
+        if verdict.kind == "unexplained" and named_effects(searched.state) and begun.chosen:
             lags = lags_of(before.state, problem, crew)  # beside the plant without them
         if outliers is not None:
             verdict = beside(verdict, outliers.sentence)
@@ -361,6 +362,8 @@ class _Judged:
         plants, lags = self.plants, self.lags
         if self.searched.state.model.effects:
             plants = PlantsBeside.of(state, problem, self.begun.wider, crew)
+            if not (self.verdict.names or named_effects(self.searched.state)):
+                plants = replace(plants, unnamed=UnnamedDynamics.of(self.searched))
             lags = plants.held_against(lags, state, problem)
         # the noise of what remains holds any effect that may be open
         weighs = self.verdict.kind != "unexplained" and loose is None

@@ -131,8 +131,11 @@ class Loop:
         return model.posterior.table.rows[model.columns[k]]
 
     def number(self, k: int) -> Weighed:
-        """A coordinate [`unit`] over the final model and each that is open to it and has it."""
-        row = self._row(k)
+        """A coordinate [`unit`] over the final model and each that is open to it and has it; of a gain the
+        steady value of the response where that has linear dynamics without a name."""
+        row, figure = self._row(k), self._steady(k)
+        if figure is not None:
+            return replace(figure, name=row.name)
         having = [place for place, part in enumerate(self._mixture.parts) if k < part.shape[1]]
         parts, weights, rivals = self._mixture.only(having)
         values = [row.value_at(part[:, k]) for part in parts]
@@ -140,10 +143,19 @@ class Loop:
         number = self.plants.number(number, row)
         return number_with_lags(number, row, self.lags, self.after.state.model.plant.table.layout)
 
+    def _steady(self, k: int) -> Weighed | None:
+        """The steady value of a path whose gain is a coordinate and is not all of it; None elsewhere."""
+        row, layout = self._row(k), self.problem.posterior.table.layout
+        dynamics = self.plants.unnamed.plants or any(effect.card.dynamics for effect in self.effects)
+        if row.kind != "gain" or not dynamics:
+            return None
+        own = {f"steady_state[{path.name}]": (path.response, path.drive) for path in layout.paths}
+        return next((one for one in self.figures if own.get(one.name) == row.place), None)
+
     @cached_property
     def figures(self) -> tuple[Weighed, ...]:
-        """Figures of the plant's response to a unit step over the longest record, its effects aside, over the
-        same models."""
+        """Figures of the plant's response to a unit step over the longest record, its effects aside but for
+        linear dynamics without a name, over the same models."""
         own, layout = self.figures_of(self.after.state, self._mixture), self.problem.posterior.table.layout
         span, unit = self.problem.scales.span, self.problem.study.time_unit
         own = self.plants.figures(own, span=span, time_unit=unit)

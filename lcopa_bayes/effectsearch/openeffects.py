@@ -70,7 +70,8 @@ class Alternative:
     weight: float
     """Beside 1 of the final model [-]."""
     shift: Vector
-    """Of its coordinates, those of the plant alone where an effect is replaced, (k,)."""
+    """Of its coordinates, those of the plant with what belongs to its response where an effect is replaced,
+    (k,)."""
     root: Matrix
     """Factor of the covariance of that, (k, m)."""
     least: float = -np.inf
@@ -204,15 +205,16 @@ class Weighed:
 
 
 def step_figures(state: State, drawn: Mixture, *, span: float, time_unit: str) -> tuple[Weighed, ...]:
-    """Figures of the plant's response to a unit step over `span` [time unit], its effects aside, over the
-    draws of a mixture; none where no draw of the final model is a plant."""
-    model = state.model
-    table = model.plant.table
+    """Figures of the plant's response to a unit step over `span` [time unit], its effects aside but for
+    linear dynamics without a name, over the draws of a mixture; none where no draw of the final model is a
+    plant."""
+    model, columns = state.model.responding
+    table = model.posterior.table
     values = []
     for part, weight in zip(drawn.parts, drawn.weights, strict=True):
         count = min(max(round(_RESPONSES * weight), _FEWEST), len(part))
-        plants = model.plants(part[np.linspace(0, len(part) - 1, count).astype(int)])
-        values.append(plants[table.supported(plants)])
+        chosen = part[np.linspace(0, len(part) - 1, count).astype(int)][:, columns]
+        values.append(model.tabulated(chosen[model.supported(chosen)]))
     if not len(values[0]):
         return ()
     kept = [number for number, one in enumerate(values) if len(one)]
@@ -270,7 +272,7 @@ def _instead(state: State, rounds: Sequence[Round]) -> list[Alternative]:
     names = {effect.name for effect in state.model.effects}
     if last is None or last.chosen is None or {e.name for e in last.chosen.model.effects} != names:
         return []
-    out, size = [], state.model.plant_size
+    out, size = [], len(state.model.responding[1])  # effects with a name come last
     for one in last.refits:
         weight = float(np.exp(min(one.log_bayes_factor - last.chosen.log_bayes_factor, 0.0)))
         if one is last.chosen or weight <= LEAST:

@@ -1,11 +1,18 @@
 """Linear dynamics that a model lacks take no name, and take none from what is no linear dynamics."""
 
+import functools
+import types
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.openeffects import Mixture, Weighed, step_figures
+from lcopa_bayes.effectsearch.plantsbeside import PlantsBeside
+from lcopa_bayes.effectsearch.unnameddynamics import UnnamedDynamics
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effects import effected
 from lcopa_bayes.model.effects.catalogue import bundled
@@ -13,6 +20,7 @@ from lcopa_bayes.model.effects.generic import UnmodelledLag, UnmodelledLinear
 
 DELAY, NOISE = 0.1, 0.01
 LEVELS = [(0.0, 1.0), (4.0, 0.0), (8.0, -0.6), (12.0, 0.3)]
+FASTER = (0.6, 1.0), (0.4, 0.15)
 LIBRARY = [bundled()[name] for name in ("backflow", "overdrive_pulse", "unmodelled_lag", "unmodelled_linear")]
 
 
@@ -42,13 +50,95 @@ def looped(study, library=LIBRARY):
     return loop(study, library=library, sample=False, quick=True, as_stated=True)
 
 
+@functools.cache
+def second_lag(*parts):
+    return looped(lagged(*parts))
+
+
 def test_a_second_lag_is_no_effect():
     """One term cannot have the zero of two lags, which an overdriven frame can imitate."""
-    found = looped(lagged((0.6, 1.0), (0.4, 0.15)))
+    found = second_lag(*FASTER)
     assert found.names == ()
     assert found.verdict.kind == "unexplained"
     assert "linear dynamics" in found.verdict.sentence
     assert any(each.chosen.dynamics for each in found.rounds if each.chosen)
+    said = found.plants.sentence
+    assert said.endswith(
+        "of the plant chosen with linear dynamics without a name, which are part of its response."
+    )
+
+
+def interval(number, level=0.9):
+    return np.quantile(number.values, [(1 - level) / 2, (1 + level) / 2])
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        FASTER,
+        pytest.param(((0.75, 1.0), (0.25, 4.0)), marks=pytest.mark.slow),
+        pytest.param(((1.2, 1.0), (-0.2, 3.0)), marks=pytest.mark.slow),
+    ],
+    ids=["faster", "slower", "back"],
+)
+def test_numbers_are_those_of_the_response_with_unnamed_dynamics(parts):
+    """A second lag beside one term: gain, delay and value at the end of the record in closed form; the gain
+    of the plant alone is another."""
+    found = second_lag(*parts)
+    assert found.names == ()
+    alone = replace(found, plants=PlantsBeside())
+    names, span = found.after.state.model.names, found.problem.scales.span
+    end = sum(share * -np.expm1(-(span - DELAY) / time) for share, time in parts)
+    own = {one.name: one for one in found.figures}
+    (low, high), (least, most) = (interval(one.number(names.index("gain"))) for one in (found, alone))
+    assert low < 1.0 < high
+    assert not least < 1.0 < most
+    assert np.array_equal(found.number(names.index("gain")).values, own["steady_state[y1]"].values)
+    low, high = interval(found.number(names.index("delay")), 0.99)
+    assert low < DELAY < high
+    low, high = interval(own["value_at_end[y1]"])
+    assert low < end < high
+
+
+def test_each_of_several_dynamics_has_the_part_that_evidence_gives_it():
+    """Second method: odds of each against none, over their sum."""
+    plants = tuple(
+        types.SimpleNamespace(log_bayes_factor=one, number=lambda _: np.ones(2)) for one in (1.0, 2.5)
+    )
+    known = UnnamedDynamics(plants)
+    whole = 1 + np.exp(1.0) + np.exp(2.5)
+    assert known.weight == pytest.approx(1 - 1 / whole)
+    plain = Weighed("delay", "s", [np.zeros(2)], np.ones(1))
+    row = types.SimpleNamespace(kind="delay", name="delay")
+    np.testing.assert_allclose(
+        known.number(plain, row).weights, np.array([1.0, np.exp(1.0), np.exp(2.5)]) / whole
+    )
+    assert known.number(plain, types.SimpleNamespace(kind="order", name="order")) is plain
+    assert UnnamedDynamics().weight == 0.0
+    assert UnnamedDynamics().number(plain, row) is plain
+
+
+def test_figures_of_a_final_model_hold_its_unnamed_dynamics():
+    """Second method: the response of the plant and a share of it that follows later, in closed form."""
+    found = second_lag(*FASTER)
+    state = found.rounds[-1].state
+    (effect,), (c,) = state.model.effects, state.optimum.x[state.model.plant_size :]
+    values = state.model.values(state.optimum.x)
+    bare = step_figures(
+        replace(state, model=state.model.having()),
+        Mixture([state.optimum.x[None, :-1]], np.ones(1)),
+        span=20.0,
+        time_unit="s",
+    )
+    whole = step_figures(state, Mixture([state.optimum.x[None]], np.ones(1)), span=20.0, time_unit="s")
+    gain, delay = (
+        float(values[state.model.posterior.table.at(kind, *at)])
+        for kind, at in (("gain", (0, 0)), ("delay", (0,)))
+    )
+    before, after = ({one.name: float(one.values[0]) for one in each} for each in (bare, whole))
+    assert after["steady_state[y1]"] == pytest.approx((1 + c) * before["steady_state[y1]"], rel=1e-6)
+    later = -np.expm1(-(20.0 - delay) / effect.time)
+    assert after["value_at_end[y1]"] == pytest.approx(before["value_at_end[y1]"] + c * gain * later, rel=1e-6)
 
 
 @pytest.mark.slow
