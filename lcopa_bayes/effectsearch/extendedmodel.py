@@ -107,6 +107,12 @@ class ExtendedModel:
         return self.scaled.effects if self.scaled else ()
 
     @property
+    def bending(self) -> bool:
+        """Whether an effect acts between commands and reading, so that responses are simulated on blocks."""
+        simulation = self.posterior.simulation
+        return simulation is not None and simulation.declared.bending
+
+    @property
     def columns(self) -> list[int]:
         """Table positions of the coordinates."""
         return self._least.columns
