@@ -29,8 +29,9 @@ _EFFECT_DRAWS = 250
 """The same with effects, which take a simulation each."""
 _AWAY = 1e6
 """A response without bounds, over its steady value [-]."""
-_STATIC = 1e-60
-"""Time constant of a plant that follows at once [time unit]."""
+_STATIC, _CALM = 1e-60, 0.5
+"""Time constant [time unit] and order [-] of a plant that follows at once: on blocks much wider than its time
+constant the response of an order above 1 alternates and grows."""
 _SETTLED_SPANS = 200.0
 """Time after which what effects add has settled, in spans of the record [-]."""
 _LATER = 4.0
@@ -94,6 +95,7 @@ def _with_effects(table: ParameterTable, values: Matrix, time: Vector) -> StepCu
     moved = _effect_steps(table, values, time)
     still = values.copy()
     still[:, table.of_kind("time")] = _STATIC
+    still[:, table.of_kind("order")] = _CALM
     still[:, table.of_kind("delay")] = 0.0
     level = _effect_steps(table, still, time[-1] * np.linspace(0.5, 1.0, 16) * _SETTLED_SPANS)[..., -1]
     kept = np.isfinite(moved).all(axis=(0, 2)) & np.isfinite(level).all(axis=0)

@@ -59,19 +59,37 @@ def test_the_evidence_speaks_for_the_effect(stiff: tuple[Fit, np.ndarray]):
     assert found.evidence.value > other.evidence.value + 10
 
 
-def test_steady_state_of_a_stiff_plant(stiff: tuple[Fit, np.ndarray]):
-    """``y + c y^3 / ymax^2 = K u`` at the largest drive."""
+@pytest.mark.parametrize("order", [None, 0.4, 1.0, 1.02, 1.3, 1.95])
+def test_steady_state_of_a_stiff_plant(stiff: tuple[Fit, np.ndarray], order: float | None):
+    """``y + c y^3 / ymax^2 = K u`` at the largest drive, whatever the order of the element."""
     found, _ = stiff
     table, ranges = found.draws.table, found.problem.ranges
     assert ranges is not None
     values = np.tile(np.median(found.draws.flat, axis=0), (4, 1))
+    if order is not None:
+        values[:, table.of_kind("order")] = order
     made = draws_of(table, values)
     reported = {one.name: one for one in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
     gain, c = values[0, 0], values[0, table.names.index("cubic_stiffness.c")]
     force, scale = gain * ranges.drive[0], ranges.response[0]
     level = brentq(lambda y: y + c * y**3 / scale**2 - force, 0, force)
     assert reported["steady_state[y]"].value == pytest.approx(level / ranges.drive[0], rel=1e-4)
-    assert reported["value_at_end[y]"].value < reported["steady_state[y]"].value
+    if order is None:
+        assert reported["value_at_end[y]"].value < reported["steady_state[y]"].value
+
+
+@pytest.mark.parametrize("order", [0.4, 1.02, 1.95])
+def test_steady_state_of_a_plant_that_creeps(order: float):
+    """``(1 + k) K``, long after the record."""
+    base = campaign(3)
+    table = problem_of(replace(base, effects=EffectsSettings(use=("ion_creep",)))).posterior.table
+    values = table.draw(1, np.random.default_rng(0))
+    given = {"gain": 2.0, "order": order, "coefficient": 0.1}
+    for kind, value in given.items():
+        values[:, table.of_kind(kind)] = value
+    made = draws_of(table, np.tile(values, (4, 1)))
+    reported = {one.name: one for one in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
+    assert reported["steady_state[y]"].value == pytest.approx(2.2, rel=1e-5)
 
 
 def test_bands_hold_a_record_that_was_not_fitted():
