@@ -121,7 +121,7 @@ class Loop:
             return here.as_json(ess=np.nan, grade=grade, interval="Laplace")
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
-        ess = ess_with_lags(own.ess, self.lags)
+        ess = min(ess_with_lags(own.ess, self.lags), self.plants.unnamed.ess)
         grade = Grade.worst((Grade(cast("Level", own.grade), ""), limit)).level
         return here.as_json(ess=ess, grade=grade, interval=own.interval) | {"alone": alone}
 

@@ -53,6 +53,11 @@ class UnnamedDynamics:
         return float(1 - np.prod([1 - share for share in self._shares]))
 
     @property
+    def ess(self) -> float:
+        """Effective draws of a number over them: the fewest of any [-]; infinite without any."""
+        return min((float(len(one.draws)) for one in self.plants), default=np.inf)
+
+    @property
     def _shares(self) -> list[float]:
         """Part of each beside the chosen plant and those before it [-]."""
         logs = np.logaddexp.accumulate([0.0, *(one.log_bayes_factor for one in self.plants)])

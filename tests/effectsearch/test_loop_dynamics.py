@@ -116,6 +116,9 @@ def test_each_of_several_dynamics_has_the_part_that_evidence_gives_it():
     assert known.number(plain, types.SimpleNamespace(kind="order", name="order")) is plain
     assert UnnamedDynamics().weight == 0.0
     assert UnnamedDynamics().number(plain, row) is plain
+    plants = tuple(types.SimpleNamespace(draws=np.zeros((count, 2))) for count in (120, 90))
+    assert UnnamedDynamics(plants).ess == 90
+    assert UnnamedDynamics().ess == np.inf
 
 
 def test_figures_of_a_final_model_hold_its_unnamed_dynamics():
