@@ -29,7 +29,7 @@ from lcopa_bayes.model.effects.effect import (
     Scene,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Plant, forced
+from lcopa_bayes.model.effects.passage import Commanded, Moved, Plant, forced
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
 
@@ -218,7 +218,12 @@ class Simulation:
     def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
         """Write the responses of plants under forces, all at once."""
         declared, axes = self.declared, len(self.table.layout.responses)
-        gains, dynamics = self.table.gains(values), self.dynamics(values)
+        gains, each = self.table.gains(values), list[Commanded]()
+        dynamics = self.table.dynamics(values) if declared.commanding else self.dynamics(values)
+        if declared.commanding:
+            each = [
+                self.simulator(self.effects(row)).commanded(self.plant(row), self.psi(row)) for row in values
+            ]
         forces = []
         for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
             if issubclass(kind, ForceEffect):
@@ -227,7 +232,7 @@ class Simulation:
                 forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
         simulator, plant = self.simulator(self.effects(values[0])), self.plant(values[0])
         scenes = [simulator.scene(r, plant) for r in range(len(out))]
-        records = forced(self.model.plain, scenes, gains, dynamics, forces, _ACCURACY)
+        records = forced(self.model.plain, scenes, gains, dynamics, forces, _ACCURACY, each)
         for record, (deflection, failures) in zip(out, records, strict=True):
             bounded[list(failures)] = False
             record.base[...] = deflection

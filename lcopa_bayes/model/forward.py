@@ -330,16 +330,16 @@ class ForwardModel:
         return list(zip(values, slopes, strict=True))
 
 
-def deflections(layout: Layout, rest: Vector, gains: Array, units: Array) -> Array:
+def deflections(layout: Layout, rest: Array, gains: Array, units: Array) -> Array:
     """Deflections of linear plants on a record, (axes, batch, samples) [response unit].
 
-    Parameters: rest of the drives, (drives,); gains, (batch, responses, drives); unit responses, (units,
-    batch, samples).
+    Parameters: rest of the drives, (drives,), or of each plant, (batch, drives); gains, (batch, responses,
+    drives); unit responses, (units, batch, samples).
     """
     out = np.zeros((len(layout.responses), *units.shape[1:]))
     for i, row in enumerate(layout.unit_of):
         for j, unit in enumerate(row):
-            out[i] += gains[:, i, j, None] * (rest[j] + units[unit])
+            out[i] += gains[:, i, j, None] * (rest[..., j, None] + units[unit])
     return out
 
 

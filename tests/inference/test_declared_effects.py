@@ -378,6 +378,8 @@ def test_scales_of_a_fit_and_of_the_records_give_the_same_model():
     [
         ("cubic_stiffness",), ("level_dependent_speed",), ("rise_fall_asymmetry",), ("overflow",),
         ("cubic_stiffness", "clipping", "vibration"), ("overdrive_pulse",), ("voltage_knee", "odd_curvature"),
+        ("clock_skew", "rise_fall_asymmetry"), ("voltage_knee", "field_dependent_delay", "cubic_stiffness"),
+        ("trigger_jitter", "overflow", "odd_curvature"),
     ],
 )  # fmt: skip
 def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):

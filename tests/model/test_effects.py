@@ -688,6 +688,30 @@ def test_plants_together_are_each_by_itself(names, psis, blocks, monkeypatch):
             assert_allclose(one.scene.delays, other.scene.delays)
 
 
+@pytest.mark.parametrize(
+    ("names", "psis"),
+    [
+        (
+            ["clock_skew", "cubic_stiffness"],
+            [[0.01, 0.2], [-0.02, 0.2], [0.01, 0.3], [0.0, 0.2], [0.01, 0.0]],
+        ),
+        (["voltage_knee", "overflow"], [[0.1, 0.3, 2.0], [0.2, 0.3, 2.0], [0.0, 0.5, 0.0], [0.1, 0.0, 1.0]]),
+    ],
+)
+def test_plants_under_commands_of_their_own_are_each_by_itself(names, psis):
+    """Forces on many plants at once, also of one that they or the effect on commands leave alone."""
+    made = BASE.with_effects([ALL[name].grid(BASE.ranges)[0] for name in names])
+    table = np.array(BASE.table.names)
+    kinds = ["none", "time", "delay", "gain", "order"]
+    factors = [np.where(np.char.startswith(table, kind), 1.02, 1.0) for kind in kinds]
+    cases = [(made.plant(VALUES * factor), np.array(psi)) for factor, psi in zip(factors, psis, strict=False)]
+    for case, moved in zip(cases, made.simulator.moved_together(cases), strict=True):
+        for one, other in zip(moved, made.simulator.moved(*case), strict=True):
+            assert_allclose(one.deflection, other.deflection, rtol=0, atol=1e-9)
+            for drive, own in zip(one.scene.drives, other.scene.drives, strict=True):
+                np.testing.assert_array_equal(drive.times, own.times)
+
+
 def test_a_plant_that_runs_backwards_among_others_is_reported():
     made = BASE.with_effects([ALL["viscosity_drift"].grid(BASE.ranges)[0]])
     plant = made.plant(VALUES)

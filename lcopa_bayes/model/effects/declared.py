@@ -78,14 +78,10 @@ class Declared:
 
     @property
     def forced(self) -> bool:
-        """Whether all that acts before the reading are forces that take many plants at once, and lags."""
+        """Whether all that acts between commands and reading are forces that take many plants at once."""
         acting = any(issubclass(kind, (ElementEffect, SensorEffect)) for kind in self.kinds)
         forces = [kind for kind in self.kinds if issubclass(kind, ForceEffect)]
-        return (
-            bool(forces)
-            and not (acting or self.commanding)
-            and all(k.batched and not k.card.per_record for k in forces)
-        )
+        return bool(forces) and not acting and all(k.batched and not k.card.per_record for k in forces)
 
     @property
     def commanding(self) -> bool:

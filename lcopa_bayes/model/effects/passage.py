@@ -11,6 +11,7 @@ import numpy as np
 from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.effects.balance import TOLERANCE, earlier, iterated, marched, resting
 from lcopa_bayes.model.effects.effect import (
@@ -78,6 +79,16 @@ class Moved(NamedTuple):
     """(samples, axes) [response unit]."""
 
 
+@final
+class Commanded(NamedTuple):
+    """One plant under commands of its own."""
+
+    scenes: Sequence[Scene]
+    """Of every record, with the commands as they act."""
+    units: Sequence[Array]
+    """Unit responses under them, per record (units, 1, samples)."""
+
+
 def linear(
     model: ForwardModel, scenes: Sequence[Scene], plant: Plant, known: StepResponses | None = None
 ) -> list[Moved]:
@@ -96,9 +107,11 @@ def forced(
     dynamics: Dynamics,
     forces: Forces,
     tolerance: float = TOLERANCE,
+    each: Sequence[Commanded] = (),
 ) -> Iterator[tuple[Array, dict[int, str]]]:
     """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
-    why some of the plants, by number, have no bounded response.
+    why some of the plants, by number, have no bounded response; under the same commands, or `each` under its
+    own.
 
     Delays below 0, of drives that were sampled while they moved, become changes that come whole sampling
     periods earlier: the forward model takes no response before its cause.
@@ -112,14 +125,23 @@ def forced(
         scenes = [replace(scene, drives=experiment.drives) for scene, experiment in pairs]
         dynamics = dynamics.later(np.full(dynamics.batch, ahead))
     kernels: Kernels = {}
-    for experiment, scene, units in zip(
-        model.experiments, scenes, model.unit_responses(dynamics), strict=True
-    ):
+    units = [] if each else model.unit_responses(dynamics)
+    for r, (experiment, scene) in enumerate(zip(model.experiments, scenes, strict=True)):
+        own = [one.scenes[r] for one in each] or [scene]
         passage = Passage(
-            model.layout, experiment, scene, gains, dynamics, forces, kernels, tolerance=tolerance
+            model.layout,
+            experiment,
+            scene,
+            gains,
+            dynamics,
+            forces,
+            kernels,
+            tolerance=tolerance,
+            commands=[(one.drives, one.rest) for one in own],
         )
         change, failures = passage.change()
-        yield deflections(model.layout, scene.rest, gains, units) + change, failures
+        moved = np.concatenate([one.units[r] for one in each], axis=1) if each else units[r]
+        yield deflections(model.layout, passage.rest, gains, moved) + change, failures
 
 
 @lru_cache(maxsize=1)
@@ -203,6 +225,13 @@ class Passage:
     """Of the sensor, with scene and coefficients of each plant."""
     tolerance: float = TOLERANCE
     """Accuracy of the balance of forces over the scale of the response [-]."""
+    commands: Sequence[tuple[tuple[AxisDrive, ...], Vector]] = ()
+    """Drives of each plant and their rest, as the forces see them; by default those of the scene."""
+
+    @property
+    def rest(self) -> Matrix:
+        """Rest of the drives of each plant, or of all, (batch or 1, drives) [drive unit]."""
+        return np.array([rest for _, rest in self.commands or [(self.scene.drives, self.scene.rest)]])
 
     def change(self) -> tuple[Array, dict[int, str]]:
         """What effects add to the deflections at the samples, (axes, batch, samples) [response unit], and why
@@ -272,23 +301,23 @@ class Passage:
         ranges, batch, grid = self.scene.ranges, len(self.gains), self.experiment.mesh.grid
         direct = list(enumerate(ranges.direct.tolist()))
         gains = np.stack([self.gains[:, i, j] for i, j in direct], axis=1)
-        rest = gains * self.scene.rest[ranges.direct]
-        drives = [self.scene.drives[j] for _, j in direct]
+        rest = gains * self.rest[:, ranges.direct]
         late = self.dynamics.delays[:, [self.layout.delay_of[i][j] for i, j in direct]]
-        starts = np.array([drive.times[0] if drive.moves else np.inf for drive in drives])
         apart = all(effect.batched for effect, _ in self.forces)
         begin = late if apart else np.repeat(late[:, :1], len(direct), axis=1)
-        starts = np.where(np.isfinite(starts) & apart, starts, min(starts.min(), grid.edges[-1]))
+        commanded = [drives for drives, _ in self.commands or [(self.scene.drives, self.scene.rest)]]
+        moving = [[drives[j] for _, j in direct] for drives in commanded]
+        starts = np.array([[one.times[0] if one.moves else np.inf for one in drives] for drives in moving])
+        first = np.minimum(starts.min(axis=1, keepdims=True), grid.edges[-1])
+        starts = np.where(np.isfinite(starts) & apart, starts, first)
         place = (grid.start - begin - starts) / grid.step
         n = max(grid.n + int(np.floor(place.max())) + 3, 3)
-        means = np.stack(
+        blocks, beyond = grid.step * np.arange(n + 1), (late - begin)[: len(moving)]  # of many plants 0
+        means = np.array(
             [
-                drive.block_means(start + grid.step * np.arange(n + 1), np.unique(beyond))[0]
-                if (beyond == beyond[0]).all()
-                else drive.block_means(start + grid.step * np.arange(n + 1), beyond)[0]
-                for drive, start, beyond in zip(drives, starts, (late - begin).T, strict=True)
-            ],
-            axis=1,
+                [one.block_means(start + blocks, by[None])[0][0] for one, start, by in zip(*own, strict=True)]
+                for own in zip(moving, starts, beyond, strict=True)
+            ]
         )
         kernel = np.stack([self._kernel(self.layout.element_of[i][j], n) for i, j in direct], axis=1)
         f0, f = rest.reshape(-1, 1), gains[..., None] * means

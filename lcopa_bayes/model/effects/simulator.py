@@ -23,7 +23,7 @@ from lcopa_bayes.model.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Plant, forced, linear, passed
+from lcopa_bayes.model.effects.passage import Commanded, Moved, Plant, forced, linear, passed
 from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
@@ -148,8 +148,8 @@ class Simulator:
         return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
 
     def moved_together(self, cases: Sequence[tuple[Plant, Vector]]) -> list[list[Moved]]:
-        """`moved` of many plants and coefficients: at once where all that acts before the reading are forces
-        that take many, or no forces and nothing on the commands.
+        """`moved` of many plants and coefficients: at once where forces that take many are all that acts
+        between commands and reading, or no forces act and nothing on the commands.
 
         Raises UnstableError.
         """
@@ -164,17 +164,23 @@ class Simulator:
             for effect, own in acting
             if isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
         ]
-        lags = [(one, own) for one, own in acting if isinstance(one, DriveEffect) and one.lags]
-        if not forces or len(forces) + len(lags) < len(acting):
+        drives = [(one, own) for one, own in acting if isinstance(one, DriveEffect)]
+        if not forces or len(forces) + len(drives) < len(acting):
             return self._passed_together(cases)
         plants, records = [plant for plant, _ in cases], range(len(self.model.experiments))
         gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
-        for effect, own in lags:
-            dynamics = dynamics.later(effect.lag(self.ranges, own.T))
-        commanded = [self.scene(r, plants[0]) for r in records]
-        scenes = [self.scenes(plant, psi) for plant, psi in cases]
+        commanded = list[Commanded]()
+        if all(effect.lags for effect, _ in drives):
+            for effect, own in drives:
+                dynamics = dynamics.later(effect.lag(self.ranges, own.T))
+            scenes = [self.scenes(plant, psi) for plant, psi in cases]
+        else:
+            commanded = [self.commanded(plant, psi) for plant, psi in cases]
+            scenes = [list(one.scenes) for one in commanded]
+        shared = [self.scene(r, plants[0]) for r in records]
         out: list[list[Moved]] = [[] for _ in plants]
-        for r, (deflection, failures) in enumerate(forced(self.model, commanded, gains, dynamics, forces)):
+        responses = forced(self.model, shared, gains, dynamics, forces, each=commanded)
+        for r, (deflection, failures) in enumerate(responses):
             if failures:
                 names = tuple(effect.name for effect, _ in forces)
                 raise UnstableError(names, self.model.experiments[r].name, next(iter(failures.values())))
@@ -239,6 +245,12 @@ class Simulator:
                     scene = replace(scene, drives=drives, rest=rest)
             out.append(scene)
         return out
+
+    def commanded(self, plant: Plant, psi: Vector) -> Commanded:
+        """A plant's own commands and its responses to them before anything acts on these."""
+        scenes = self.scenes(plant, psi)
+        known = self.step_responses.get_or(plant.elements, dict)
+        return Commanded(scenes, self.driven(scenes).unit_responses(plant.dynamics, known))
 
     def driven(self, scenes: Sequence[Scene]) -> ForwardModel:
         """The forward model under the commands of the scenes."""
