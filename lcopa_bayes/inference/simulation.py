@@ -8,7 +8,7 @@ effect before the reading all share one call of the forward model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, final
@@ -36,6 +36,8 @@ from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
 _ACCURACY = 1e-9
 """Accuracy of responses under forces over their scale [-]: slopes are not taken from them (`effects`), and
 noise is some thousand times as large."""
+_ABREAST = 64
+"""Plants whose responses on blocks are kept at once [-]."""
 
 
 @final
@@ -159,22 +161,13 @@ class Simulation:
             )
             for r, n in enumerate(sizes)
         ]
-        effects, simulator = None, None
         pending = np.arange(0 if declared.forced else batch)
         if declared.forced:
             self._forced(values, out, bounded)
         elif self._scales_commands(values):
             pending = self._commanded(values, out)
-        for b in pending.tolist():
-            row = values[b]
-            own = self.effects(row)
-            if simulator is None or own != effects:
-                effects, simulator = own, self.simulator(own)
-            units = None if shared is None else [each[:, b : b + 1] for each in shared]
-            try:
-                self._one(simulator, row, units, b, out)
-            except UnstableError:
-                bounded[b] = False
+        for some in np.array_split(pending, max(1, -(-pending.size // _ABREAST))):
+            self._each(values, some.tolist(), shared, out)
         for record in out:
             for each in (*record.base, *record.columns.values()):
                 each[~bounded] = 0.0
@@ -214,6 +207,47 @@ class Simulation:
             drive = row.place.second
             return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
         return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
+
+    def _each(
+        self, values: Matrix, some: Sequence[int], shared: list[Array] | None, out: list[Simulated]
+    ) -> None:
+        """Write the responses of some plants, each with effects of its own."""
+        alike: dict[tuple[Effect, ...], list[int]] = {}
+        for b in some:
+            alike.setdefault(self.effects(values[b]), []).append(b)
+        for effects, own in alike.items():
+            simulator, together = self.simulator(effects), self._moved(effects, values[own])
+            for number, b in enumerate(own):
+                units = None if shared is None else [each[:, b : b + 1] for each in shared]
+                try:
+                    moved = together[number] if together else self._unread(simulator, values[b], units)
+                    self._one(simulator, values[b], moved, b, out)
+                except UnstableError:
+                    out[0].bounded[b] = False
+
+    def _moved(self, effects: tuple[Effect, ...], values: Matrix) -> list[list[list[Moved]]]:
+        """Of each plant, the records of every part of its response up to its reading, where elements and the
+        sensor alone bend them, of many at once; none elsewhere, or where one has no bounded response."""
+        places = (DriveEffect, ForceEffect)
+        if not self.declared.bending or any(isinstance(effect, places) for effect in effects):
+            return []
+        parts = [self._parts(self.plant(row)) for row in values]
+        psis = [self.psi(self._without_scaled(row)) for row in values]
+        cases = [(part, psi) for own, psi in zip(parts, psis, strict=True) for part in own]
+        try:
+            moved = self.simulator(effects).moved_together(cases)
+        except UnstableError:
+            return []
+        size = len(parts[0])
+        return [moved[first : first + size] for first in range(0, len(moved), size)]
+
+    def _parts(self, plant: Plant) -> list[Plant]:
+        """Plants whose readings make up the response of one: where it is linear in its gains, those with unit
+        gains of one drive each."""
+        if not self.declared.affine:
+            return [plant]
+        responses, drives = plant.gains.shape
+        return [replace(plant, gains=np.tile(unit, (responses, 1))) for unit in np.eye(drives)]
 
     def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
         """Write the responses of plants under forces, all at once."""
@@ -299,15 +333,12 @@ class Simulation:
         return still
 
     def _one(
-        self, simulator: Simulator, row: Vector, units: list[Array] | None, b: int, out: list[Simulated]
+        self, simulator: Simulator, row: Vector, moved: list[list[Moved]], b: int, out: list[Simulated]
     ) -> None:
-        """Write one plant's responses."""
+        """Write one plant's responses from those of its parts up to their reading."""
         plant, psi = self.plant(row), self.psi(self._without_scaled(row))
-        if units is None and not self.declared.bending:
-            driven = simulator.driven(simulator.scenes(plant, psi))
-            units = driven.unit_responses(plant.dynamics)
         if not self.declared.affine:
-            for record, y in zip(out, self._read(simulator, plant, psi, units), strict=True):
+            for record, y in zip(out, simulator.finished(moved[0], psi), strict=True):
                 record.base[:, b] = y.T
         else:
             zero = replace(plant, gains=np.zeros_like(plant.gains))
@@ -316,29 +347,29 @@ class Simulation:
             base = simulator.finished(rest, psi)
             for record, y in zip(out, base, strict=True):
                 record.base[:, b] = y.T
-            for j in range(plant.gains.shape[1]):
-                gains = np.zeros_like(plant.gains)
-                gains[:, j] = 1.0
-                read = self._read(simulator, replace(plant, gains=gains), psi, units)
-                for record, y, nothing in zip(out, read, base, strict=True):
-                    for i in range(gains.shape[0]):
+            for j, part in enumerate(moved):
+                for record, y, nothing in zip(out, simulator.finished(part, psi), base, strict=True):
+                    for i in range(len(plant.gains)):
                         k = self.table.at("gain", i, j)
                         if k in record.columns:
                             record.columns[k][b] = (y - nothing)[:, i]
         self._added(simulator, plant, b, out)
 
-    def _read(
-        self, simulator: Simulator, plant: Plant, psi: Vector, units: list[Array] | None
-    ) -> list[Matrix]:
-        """Deflections of one plant as read, per record (samples, axes)."""
-        if units is None:
-            return simulator.finished(simulator.moved(plant, psi), psi)
+    def _unread(self, simulator: Simulator, row: Vector, units: list[Array] | None) -> list[list[Moved]]:
+        """Of one plant, the records of every part of its response up to its reading, by its unit responses
+        where they are known."""
+        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        if self.declared.bending:
+            return [simulator.moved(part, psi) for part in self._parts(plant)]
         scenes = simulator.scenes(plant, psi)
-        moved = [
-            Moved(scene, deflections(self.table.layout, scene.rest, plant.gains[None], each)[:, 0].T)
-            for scene, each in zip(scenes, units, strict=True)
+        units = units or simulator.driven(scenes).unit_responses(plant.dynamics)
+        return [
+            [
+                Moved(scene, deflections(self.table.layout, scene.rest, part.gains[None], each)[:, 0].T)
+                for scene, each in zip(simulator.scenes(part, psi), units, strict=True)
+            ]
+            for part in self._parts(plant)
         ]
-        return simulator.finished(moved, psi)
 
     def _added(self, simulator: Simulator, plant: Plant, b: int, out: list[Simulated]) -> None:
         """Columns of the coefficients that only add."""

@@ -379,7 +379,8 @@ def test_scales_of_a_fit_and_of_the_records_give_the_same_model():
         ("cubic_stiffness",), ("level_dependent_speed",), ("rise_fall_asymmetry",), ("overflow",),
         ("cubic_stiffness", "clipping", "vibration"), ("overdrive_pulse",), ("voltage_knee", "odd_curvature"),
         ("clock_skew", "rise_fall_asymmetry"), ("voltage_knee", "field_dependent_delay", "cubic_stiffness"),
-        ("trigger_jitter", "overflow", "odd_curvature"),
+        ("trigger_jitter", "overflow", "odd_curvature"), ("viscosity_drift",), ("sensor_lag", "clock_skew"),
+        ("exposure", "viscosity_drift", "vibration"), ("sensor_lag", "odd_curvature"),
     ],
 )  # fmt: skip
 def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):
@@ -429,6 +430,21 @@ def test_a_force_that_runs_away_leaves_the_other_plants_alone():
     reported = simulation(values)
     assert reported[0].bounded.tolist() == [True, False, True]
     assert_array_equal(reported[0].base[0, 1], 0.0)
+
+
+def test_a_plant_that_runs_backwards_leaves_the_other_plants_alone():
+    made = using(one_axis(), "viscosity_drift")
+    values = np.tile(values_of(made, 1.0), (3, 1))
+    values[1, made.posterior.table.names.index("viscosity_drift.d")] = 40.0
+    simulation = made.posterior.simulation
+    assert simulation is not None
+    reported = simulation(values)
+    assert reported[0].bounded.tolist() == [True, False, True]
+    others = simulation(values[[0, 2]])
+    for one, other in zip(reported, others, strict=True):
+        for k, column in other.columns.items():
+            assert_allclose(one.columns[k][[0, 2]], column, rtol=0, atol=1e-9)
+            assert_array_equal(one.columns[k][1], 0.0)
 
 
 def test_places_in_the_campaign_go_by_name_and_numbers_by_value():
