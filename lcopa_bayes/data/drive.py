@@ -53,7 +53,10 @@ class AxisDrive:
 
     def later(self, by: Vector | float) -> AxisDrive:
         """With every change later by a time [time unit], one or (changes,); they may change places."""
-        return AxisDrive.of_jumps(self.times + by, self.jumps)
+        at = self.times + by
+        if (np.diff(at) > 0).all():
+            return AxisDrive(at, self.values)
+        return AxisDrive.of_jumps(at, self.jumps)
 
     @cached_property
     def jumps(self) -> Vector:

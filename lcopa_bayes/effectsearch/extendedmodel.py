@@ -107,10 +107,11 @@ class ExtendedModel:
         return self.scaled.effects if self.scaled else ()
 
     @property
-    def bending(self) -> bool:
-        """Whether an effect acts between commands and reading, so that responses are simulated on blocks."""
+    def upstream(self) -> bool:
+        """Whether an effect acts before the reading, so that plants share little of their simulation."""
         simulation = self.posterior.simulation
-        return simulation is not None and simulation.declared.bending
+        declared = None if simulation is None else simulation.declared
+        return declared is not None and (declared.bending or declared.commanding)
 
     @property
     def columns(self) -> list[int]:

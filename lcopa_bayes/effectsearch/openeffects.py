@@ -45,8 +45,8 @@ _CERTAIN = 300.0
 _DRAWS = 4000
 """Draws of all models together [-]."""
 _FOLLOWING, _SIMULATED = 1000, 250
-"""Draws about an optimum whose likelihood is computed, and where each is simulated on blocks [-]: of the ends
-of 90 % intervals so few leave 0.13 standard deviations open."""
+"""Draws about an optimum whose likelihood is computed, and where effects act before the reading [-]: of the
+ends of 90 % intervals so few leave 0.13 standard deviations open."""
 _RESPONSES = 400
 """Step responses of all models together [-]."""
 _FEWEST = 10
@@ -150,7 +150,7 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> M
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
-        own = draws_about(state, rng, _SIMULATED if state.model.bending else _FOLLOWING)
+        own = draws_about(state, rng, _SIMULATED if state.model.upstream else _FOLLOWING)
     parts, weights, rivals = [own], [1.0], []
     with_others = 1.0 + sum(one.weight for one in found if not one.instead)
     for one in found:

@@ -341,9 +341,8 @@ class Simulation:
             for record, y in zip(out, simulator.finished(moved[0], psi), strict=True):
                 record.base[:, b] = y.T
         else:
-            zero = replace(plant, gains=np.zeros_like(plant.gains))
-            scenes = simulator.scenes(zero, psi)
-            rest = [Moved(scene, np.zeros((scene.times.size, len(plant.gains)))) for scene in scenes]
+            none = np.zeros_like(plant.gains)
+            rest = [Moved(replace(scene, gains=none), np.zeros_like(y)) for scene, y in moved[0]]
             base = simulator.finished(rest, psi)
             for record, y in zip(out, base, strict=True):
                 record.base[:, b] = y.T
@@ -365,8 +364,11 @@ class Simulation:
         units = units or simulator.driven(scenes).unit_responses(plant.dynamics)
         return [
             [
-                Moved(scene, deflections(self.table.layout, scene.rest, part.gains[None], each)[:, 0].T)
-                for scene, each in zip(simulator.scenes(part, psi), units, strict=True)
+                Moved(
+                    replace(scene, gains=part.gains),
+                    deflections(self.table.layout, scene.rest, part.gains[None], each)[:, 0].T,
+                )
+                for scene, each in zip(scenes, units, strict=True)
             ]
             for part in self._parts(plant)
         ]
