@@ -2,8 +2,8 @@
 
 Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains
 can be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients
-that only add a fixed shape in time. Each plant is simulated by itself (`model.effects.simulator`); without an
-effect before the reading all share one call of the forward model.
+that only add a fixed shape in time. Plants share the calls of `model.effects.simulator` where effects that
+act before the reading take many; without any all share one call of the forward model.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from lcopa_bayes.model.effects.effect import (
     Scene,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Commanded, Moved, Plant, forced
-from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.effects.passage import Moved, Plant, forced
+from lcopa_bayes.model.effects.simulator import UPSTREAM, Simulator
 from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
 
 _ACCURACY = 1e-9
@@ -151,15 +151,14 @@ class Simulation:
         shared = None
         if not (declared.bending or declared.commanding):
             shared = self.model.plain.unit_responses(self.dynamics(values))
-        sizes = [times.size for times in declared.times]
         bounded = np.ones(batch, dtype=bool)
         out = [
             Simulated(
-                np.zeros((len(layout.responses), batch, n)),
-                {k: np.zeros((batch, n)) for k in self.scaled if self._acts(k, r)},
+                np.zeros((len(layout.responses), batch, times.size)),
+                {k: np.zeros((batch, times.size)) for k in self.scaled if self._acts(k, r)},
                 bounded,
             )
-            for r, n in enumerate(sizes)
+            for r, times in enumerate(declared.times)
         ]
         pending = np.arange(0 if declared.forced else batch)
         if declared.forced:
@@ -203,8 +202,7 @@ class Simulation:
         """Whether a scaled row acts on a record."""
         row = self.table.rows[k]
         if row.kind == "gain":
-            experiment = self.model.experiments[r]
-            drive = row.place.second
+            experiment, drive = self.model.experiments[r], row.place.second
             return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
         return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
 
@@ -212,12 +210,16 @@ class Simulation:
         self, values: Matrix, some: Sequence[int], shared: list[Array] | None, out: list[Simulated]
     ) -> None:
         """Write the responses of some plants, each with effects of its own."""
+        simulators: dict[tuple[Effect, ...], Simulator] = {}
         alike: dict[tuple[Effect, ...], list[int]] = {}
-        for b in some:
-            alike.setdefault(self.effects(values[b]), []).append(b)
-        for effects, own in alike.items():
-            simulator, together = self.simulator(effects), self._moved(effects, values[own])
+        effects = {b: self.effects(values[b]) for b in some}
+        for b, every in effects.items():
+            simulators[every] = self.simulator(every)
+            alike.setdefault(tuple(one for one in every if isinstance(one, UPSTREAM)), []).append(b)
+        for own in alike.values():
+            together = self._moved(simulators[effects[own[0]]], values[own])
             for number, b in enumerate(own):
+                simulator = simulators[effects[b]]
                 units = None if shared is None else [each[:, b : b + 1] for each in shared]
                 try:
                     moved = together[number] if together else self._unread(simulator, values[b], units)
@@ -225,17 +227,17 @@ class Simulation:
                 except UnstableError:
                     out[0].bounded[b] = False
 
-    def _moved(self, effects: tuple[Effect, ...], values: Matrix) -> list[list[list[Moved]]]:
+    def _moved(self, simulator: Simulator, values: Matrix) -> list[list[list[Moved]]]:
         """Of each plant, the records of every part of its response up to its reading, where elements and the
         sensor alone bend them, of many at once; none elsewhere, or where one has no bounded response."""
-        places = (DriveEffect, ForceEffect)
-        if not self.declared.bending or any(isinstance(effect, places) for effect in effects):
+        apart = any(isinstance(effect, (DriveEffect, ForceEffect)) for effect in simulator.effects)
+        if apart or not self.declared.bending:
             return []
         parts = [self._parts(self.plant(row)) for row in values]
         psis = [self.psi(self._without_scaled(row)) for row in values]
         cases = [(part, psi) for own, psi in zip(parts, psis, strict=True) for part in own]
         try:
-            moved = self.simulator(effects).moved_together(cases)
+            moved = simulator.moved_together(cases)
         except UnstableError:
             return []
         size = len(parts[0])
@@ -252,12 +254,10 @@ class Simulation:
     def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
         """Write the responses of plants under forces, all at once."""
         declared, axes = self.declared, len(self.table.layout.responses)
-        gains, each = self.table.gains(values), list[Commanded]()
+        gains, commanded = self.table.gains(values), values if declared.commanding else values[:0]
         dynamics = self.table.dynamics(values) if declared.commanding else self.dynamics(values)
-        if declared.commanding:
-            each = [
-                self.simulator(self.effects(row)).commanded(self.plant(row), self.psi(row)) for row in values
-            ]
+        pairs = ((self.simulator(self.effects(row)), row) for row in commanded)
+        each = [one.commanded(self.plant(row), self.psi(row)) for one, row in pairs]
         forces = []
         for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
             if issubclass(kind, ForceEffect):

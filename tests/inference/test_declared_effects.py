@@ -381,6 +381,7 @@ def test_scales_of_a_fit_and_of_the_records_give_the_same_model():
         ("clock_skew", "rise_fall_asymmetry"), ("voltage_knee", "field_dependent_delay", "cubic_stiffness"),
         ("trigger_jitter", "overflow", "odd_curvature"), ("viscosity_drift",), ("sensor_lag", "clock_skew"),
         ("exposure", "viscosity_drift", "vibration"), ("sensor_lag", "odd_curvature"),
+        ("exposure", "backflow"),
     ],
 )  # fmt: skip
 def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):

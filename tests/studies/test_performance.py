@@ -17,6 +17,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import kstest
 from small import record, study
 
+from lcopa_bayes.bench.undeclared import NOISE
 from lcopa_bayes.cli import VERBS
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.conditional import Conditional
@@ -26,6 +27,7 @@ FOLDER = Path(__file__).parents[2] / "studies" / "performance"
 sys.path.insert(0, str(FOLDER))
 
 import comparison  # noqa: E402
+import effects  # noqa: E402
 import forward  # noqa: E402
 import growth  # noqa: E402
 import page  # noqa: E402
@@ -485,3 +487,39 @@ def test_a_growth_record_of_means_states_its_loss(monkeypatch):
     for one, count in zip(row["losses"], (2, 4), strict=True):
         assert one.startswith(f"Means of {count} samples")
     assert row["memory_MB"] >= row["loss_MB"] > 0
+
+
+def test_the_cost_of_an_effect_is_that_of_the_plants_with_it():
+    """Many plants and one at a time respond alike; a pair has a line of the table, each a stored row."""
+    study, device = effects.campaign_study(2)
+    every = effects.tried()
+    assert ("outliers",) not in every
+    assert {("cubic_stiffness",), ("clock_skew", "rise_fall_asymmetry")} <= set(every)
+    rows = [
+        effects.measured(names, study, device, plants=8, rounds=2)
+        for names in (("odd_curvature",), ("voltage_knee", "cubic_stiffness"))
+    ]
+    assert all(one.differs < effects.SAME for one in rows)
+    assert all(one.over_plain.count == one.over_alone.count == 2 for one in rows)
+    assert "| voltage_knee, cubic_stiffness |" in effects.report(rows, 8)
+    stored = json.loads(json.dumps(effects.stored(rows), allow_nan=False))
+    assert [one["names"] for one in stored] == [list(one.names) for one in rows]
+
+
+def test_plants_near_a_device_respond_as_it_does():
+    """Second method: records of the bench, which a hundredth of every number moves by as much."""
+    study, device = effects.campaign_study(2)
+    posterior = problem_of(study).posterior
+    values = effects.near_device(posterior.table, device, 3, np.random.default_rng(0))
+    gains = posterior.table.gains(values)
+    assert_allclose(gains[:, 0, 1], device.paths[0][1].steady, rtol=0.05)
+    for k in range(3):
+        for r, samples in enumerate(posterior.samples):
+            units = effects.responses(posterior, values)[r][:, k]
+            for axis, observed in enumerate(samples.axes):
+                moved = sum(
+                    gains[k, axis, j] * units[unit]
+                    for j, unit in enumerate(posterior.table.layout.unit_of[axis])
+                )[observed.index]
+                own = observed.values - device.offsets[axis]
+                assert np.std(own - moved) < 1.2 * NOISE + 0.05 * np.std(own)
