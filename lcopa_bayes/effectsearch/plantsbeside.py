@@ -33,13 +33,7 @@ class PlantsBeside:
     """With linear dynamics without a name, where these are missing and the final model has none."""
 
     @classmethod
-    def of(
-        cls,
-        state: State,
-        problem: Problem,
-        wider: Sequence[State] | None,
-        crew: Crew = ALONE,
-    ) -> Self:
+    def of(cls, state: State, problem: Problem, wider: Sequence[State] | None, crew: Crew = ALONE) -> Self:
         """Those beside a final state: of a base fit's `wider` states, and with integer orders; none of a
         plant whose structure is stated, where `wider` is None."""
         if wider is None:

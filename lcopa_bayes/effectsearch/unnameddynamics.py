@@ -10,6 +10,7 @@ plant with any of them, whatever it is called.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self, final
 
@@ -84,11 +85,11 @@ class UnnamedDynamics:
 def _loosened(one: Refit, *, remains: bool) -> OtherPlant:
     """The plant of a refit with its internal constants free; under the noise that its residual has where
     something `remains`."""
-    state = one.state
-    wide = loosened(one.model, one.added)
+    state, wide = one.state, loosened(one.model, one.added)
     if len(wide.columns) > len(one.model.columns):
         start = wide.coordinates(one.model.values(one.optimum.x))
-        state = replace(state, model=wide, optimum=Regression(wide, one.whitening).descend(start))
+        with suppress(ArithmeticError):  # constants stay where a descent meets no bounded response
+            state = replace(state, model=wide, optimum=Regression(wide, one.whitening).descend(start))
     if remains:
         optimum, whitening = settled(state.model, state.optimum, state.whitening)
         state = State(state.model, optimum, whitening)
