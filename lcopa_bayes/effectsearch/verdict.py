@@ -169,6 +169,11 @@ class Findings:
     preferred: bool = False
     """Whether the records prefer sums of lags to the plant on a response axis."""
 
+    @property
+    def contested(self) -> bool:
+        """Whether an effect with a name is ahead of every generic class, though by too little to be named."""
+        return 0.0 < self.largest - self.generic <= MARGIN
+
 
 def decide(given: Findings) -> Verdict:
     """The verdict from a base fit that can be used."""
@@ -177,7 +182,7 @@ def decide(given: Findings) -> Verdict:
         return _quiet(given, confidence)
     refused = _refused(given)
     if refused:
-        apart = given.apart or not given.effects
+        apart = given.apart if given.effects else given.linear or given.dynamics or not given.contested
         apart = apart and not (given.linear and given.linear.astray)
         return Verdict("unexplained", confidence if apart else "tentative", refused)
     named, one = ", ".join(given.effects), len(given.effects) == 1

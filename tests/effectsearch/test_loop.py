@@ -553,6 +553,10 @@ def test_why_nothing_is_named_is_said():
     low, level = (replace(none, generic=none.largest - by) for by in (3.1, 2.9))
     assert "no effect of the library survives a full refit: no name" in decide(low).sentence
     assert "unmodelled_nonlinear describes it as well as any effect" in decide(level).sentence
+    # that there is no name is firm, unless one is ahead of what has none, and that alone keeps it back
+    ahead = replace(none, generic=none.largest)
+    assert [decide(one).confidence for one in (low, level, ahead)] == ["firm", "tentative", "firm"]
+    assert decide(replace(level, dynamics=True)).confidence == "firm"
 
 
 def test_what_chance_may_explain_is_said_beside_clean():
