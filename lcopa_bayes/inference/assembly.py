@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.parallel import keep_freed_memory
 from lcopa_bayes.data.record import Driven, Record
 from lcopa_bayes.data.settings import EffectsSettings
@@ -28,6 +28,8 @@ from lcopa_bayes.model.layout import Layout
 _WIDER = 4
 """Most by which the blocks of a search are wider [-]: draws of a dryer's posterior on blocks four times wider
 are worth 0.96 of as many of its own, on blocks eight times wider 0.2."""
+_COARSER, _LONGEST = 2.0, 1_000_000
+"""Most by which blocks of other records are wider than those of the fit, and most of them in a record [-]."""
 
 
 @final
@@ -46,9 +48,34 @@ class Problem:
     """Their scales; None without any."""
 
     def simulated(self, records: Sequence[Record]) -> tuple[tuple[Samples, ...], ForwardModel]:
-        """Samples of other records of the same axes, and the model that simulates them."""
-        layout, period = self.posterior.table.layout, self.scales.period
-        samples, model = prepared(self.study, layout, records, period, refinement=self.refinement)
+        """Samples of other records of the same axes, and the model that simulates them: on blocks hardly
+        wider than those of the fit, which resolve the plants that it left.
+
+        InputError for records that would take more than a million.
+        """
+        return self._simulated(records, self._resolved(records))
+
+    def _resolved(self, records: Sequence[Driven]) -> float:
+        """Width of blocks [time unit] up to which they resolve what those of the fit do; InputError for
+        records that would take too many of them."""
+        moving = (one for one in self.posterior.model.experiments if any(one.phases))
+        widest = _COARSER * max((one.mesh.lattice.step for one in moving), default=np.inf)
+        refuse_if(
+            [
+                f"{one.name}: lasts {np.ptp(one.time):.3g} {self.study.time_unit}, where the fit resolves "
+                f"{widest:.3g} {self.study.time_unit}, and at most {_LONGEST} times that can be simulated; "
+                "give a part of it"
+                for one in records
+                if np.ptp(one.time) > _LONGEST * widest
+            ]
+        )
+        return widest
+
+    def _simulated(
+        self, records: Sequence[Record], widest: float = np.inf
+    ) -> tuple[tuple[Samples, ...], ForwardModel]:
+        layout, period, fine = self.posterior.table.layout, self.scales.period, self.refinement
+        samples, model = prepared(self.study, layout, records, period, refinement=fine, widest=widest)
         if self.ranges is None:
             return samples, model
         return samples, replace(model, effects=declared(self.study, self.kinds, self.ranges, records))
@@ -62,7 +89,8 @@ class Problem:
         return replace(self.study.effects, deflection=deflections, speed=self.ranges.speed)
 
     def driven(self, drive: Driven, times: Vector) -> ForwardModel:
-        """The model that simulates a drive, read at `times` [time unit], in the middle of the campaign."""
+        """The model that simulates a drive, read at `times` [time unit], in the middle of the campaign; its
+        blocks and InputError are as in `simulated`."""
         wanted, layout = self.study.model, self.posterior.table.layout
         own = self.posterior.table.effects
         model = forward_model(
@@ -72,6 +100,7 @@ class Problem:
             blocks=wanted.blocks,
             exposure=self.study.exposure,
             refinement=self.refinement,
+            widest=self._resolved([drive]),
         )
         if own is None:
             return model
@@ -80,7 +109,7 @@ class Problem:
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""
         problem = replace(self, refinement=self.refinement * factor)
-        _, model = problem.simulated(self.study.fit)
+        _, model = problem._simulated(self.study.fit)
         return replace(problem, posterior=replace(self.posterior, model=model))
 
     def at_least(self, refinement: int) -> Problem:
@@ -169,7 +198,13 @@ def _tabled(
 
 
 def prepared(
-    study: Study, layout: Layout, records: Sequence[Record], period: float, *, refinement: int = 1
+    study: Study,
+    layout: Layout,
+    records: Sequence[Record],
+    period: float,
+    *,
+    refinement: int = 1,
+    widest: float = np.inf,
 ) -> tuple[tuple[Samples, ...], ForwardModel]:
     """Samples of records and the model that simulates them with a study's settings."""
     samples = tuple(Samples.of(record, period) for record in records)
@@ -180,5 +215,6 @@ def prepared(
         blocks=study.model.blocks,
         exposure=study.exposure,
         refinement=refinement,
+        widest=widest,
     )
     return samples, model

@@ -90,11 +90,14 @@ class Experiment:
         blocks: int | None = None,
         exposure: float = 0.0,
         refinement: int = 1,
+        widest: float = np.inf,
     ) -> Experiment:
         """For reading `record` at `times` [time unit]; see `Mesh.of_samples` for the options."""
         drives = axis_drives(record)
         begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
-        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
+        mesh = Mesh.of_samples(
+            times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement, widest=widest
+        )
         aligned = tuple(AxisDrive(mesh.lattice.aligned(drive.times), drive.values) for drive in drives)
         return cls(record.name, mesh, aligned, record.drive[0])
 
@@ -351,10 +354,12 @@ def forward_model(
     blocks: int | None = None,
     exposure: float = 0.0,
     refinement: int = 1,
+    widest: float = np.inf,
 ) -> ForwardModel:
-    """Forward model of `records`, each read at its own `times` [time unit]."""
+    """Forward model of `records`, each read at its own `times` [time unit], on blocks as `Mesh.of_samples`
+    chooses them."""
     experiments = (
-        Experiment.of(record, at, blocks=blocks, exposure=exposure, refinement=refinement)
+        Experiment.of(record, at, blocks=blocks, exposure=exposure, refinement=refinement, widest=widest)
         for record, at in zip(records, times, strict=True)
     )
     return ForwardModel(layout, tuple(experiments))

@@ -154,6 +154,7 @@ class Mesh:
         blocks: int | None = None,
         exposure: float = 0.0,
         refinement: int = 1,
+        widest: float = np.inf,
     ) -> Mesh:
         """For samples at `times`, when nothing moves before `begin` (the first drive change).
 
@@ -163,8 +164,19 @@ class Mesh:
         mean over ``[t - exposure, t]``.
 
         Parameters: times (samples,) increasing [time unit]; blocks: at least so many blocks, or
-        chosen from the samples; exposure [time unit] >= 0; refinement: blocks are narrower by this factor.
+        chosen from the samples; exposure [time unit] >= 0; refinement: blocks are narrower by this factor,
+        and by a further one where they would be wider than the `widest` [time unit].
         """
+        mesh = cls._of_samples(times, begin, blocks, exposure, refinement)
+        if not mesh.lattice.step > widest or times[-1] <= times[0]:
+            return mesh
+        further = ceil(mesh.lattice.step / widest)
+        return cls._of_samples(times, begin, blocks, exposure, refinement * further)
+
+    @classmethod
+    def _of_samples(
+        cls, times: Vector, begin: float, blocks: int | None, exposure: float, refinement: int
+    ) -> Mesh:
         if times[-1] <= begin:
             begin = times[0]
         span = float(times[-1] - begin)

@@ -15,7 +15,7 @@ from lcopa_bayes.core.units import per
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
-from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout, Unit
 from lcopa_bayes.sampling.convergence import Limitation
@@ -32,6 +32,11 @@ _AWAY = 1e6
 _STATIC, _CALM = 1e-60, 0.5
 """Time constant [time unit] and order [-] of a plant that follows at once: on blocks much wider than its time
 constant the response of an order above 1 alternates and grows."""
+_RESOLVED, _RINGING = 1.0, 0.1
+"""Width of blocks over the longest time constant of an element of an order just above 1, and of order 2 [-]:
+on much wider ones the response alternates and grows."""
+_MOST = 1 << 17
+"""Blocks of a step response at most [-]."""
 _SETTLED_SPANS = 200.0
 """Time after which what effects add has settled, in spans of the record [-]."""
 _LATER = 4.0
@@ -39,6 +44,9 @@ _LATER = 4.0
 mode that crosses the steady value at the record's end is outside it again long before."""
 _LATER_POINTS = 800
 """Samples of the response after the record."""
+_FAST, _NEAREST, _ONSET_POINTS = 20.0, 1e-3, 120
+"""Samples of a step response below which a rise is read off times of its own after each delay, the first of
+these [sampling periods], and their number [-]."""
 _SETTLED = 0.02
 """A response within this share of its steady value counts as settled [-]."""
 _ROUNDING = 1e-6
@@ -113,11 +121,12 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     unit]; NaN where there is no bounded one."""
     effects = table.effects
     assert effects is not None
-    heights, experiments = effects.ranges.drive, []
+    widest = max(float(_resolved(table.dynamics(values)).min()), float(time[-1]) / _MOST)
+    heights, experiments, mesh = effects.ranges.drive, [], Mesh.of_samples(time, 0.0, widest=widest)
     for j, height in enumerate(heights):
         step = AxisDrive(np.zeros(1), np.array([float(height)]))
         drives = tuple(step if j == k else AxisDrive(np.empty(0), np.empty(0)) for k in range(heights.size))
-        experiments.append(Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(heights.size)))
+        experiments.append(Experiment("step", mesh, drives, np.zeros(heights.size)))
     count = len(experiments)
     over = replace(effects, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
     model = ForwardModel(table.layout, tuple(experiments), over)
@@ -127,13 +136,52 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
 
 
 def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
-    """Responses to a unit step at time 0 over their steady values, (units, draws, n) [-]."""
+    """Responses to a unit step at time 0 over their steady values, (units, draws, n) [-].
+
+    After so many blocks that resolve its fastest term a response is read without terms of an order above 1,
+    which have long ended; draws of about as fast ones together.
+    """
+    dynamics = table.dynamics(values)
+    widths, out = _resolved(dynamics), np.empty((len(table.layout.units), len(values), time.size))
+    decades = np.floor(np.log10(np.minimum(widths * _MOST / time[-1], 1.0)))
+    for decade in np.unique(decades):
+        rows = np.flatnonzero(decades == decade)
+        rows = rows[np.argsort(widths[rows], kind="stable")]
+        for some in np.array_split(rows, max(1, rows.size // 64)):
+            part, widest = table.dynamics(values[some]), float(widths[some].min())
+            begin = int(np.searchsorted(time, _MOST * widest))
+            if begin:
+                out[:, some, :begin] = _stepped(table.layout, part, time[:begin], widest)
+            if begin < time.size:
+                late = _without_fast_terms(part)
+                out[:, some, begin:] = _stepped(table.layout, late, time[begin:], np.inf)
+    return out
+
+
+def _stepped(layout: Layout, dynamics: Dynamics, time: Vector, widest: float) -> Array:
+    """The same at some of the times, on blocks of a width at most."""
     step = AxisDrive(np.zeros(1), np.ones(1))
-    rest = np.zeros(len(table.layout.drives))
-    drives = tuple(step for _ in table.layout.drives)
-    model = ForwardModel(table.layout, (Experiment("step", Mesh.of_samples(time, 0.0), drives, rest),))
-    parts = np.array_split(values, max(1, values.shape[0] // 64))
-    return np.concatenate([model.unit_responses(table.dynamics(part))[0] for part in parts], axis=1)
+    mesh, rest = Mesh.of_samples(time, 0.0, widest=widest), np.zeros(len(layout.drives))
+    experiment = Experiment("step", mesh, tuple(step for _ in layout.drives), rest)
+    return ForwardModel(layout, (experiment,)).unit_responses(dynamics)[0]
+
+
+def _resolved(dynamics: Dynamics) -> Vector:
+    """Width of blocks that resolve every element of an order above 1 of each plant, (batch,) [time unit];
+    infinite without any."""
+    widest = np.full(dynamics.batch, np.inf)
+    for times, orders in zip(dynamics.times, dynamics.orders, strict=True):
+        top = orders.max(axis=1)
+        share = np.where(top > 1.0, _RESOLVED + (_RINGING - _RESOLVED) * (top - 1.0), np.inf)
+        widest = np.minimum(widest, share * times.max(axis=1))
+    return widest
+
+
+def _without_fast_terms(dynamics: Dynamics) -> Dynamics:
+    """Elements without their terms of an order above 1."""
+    pairs = list(zip(dynamics.times, dynamics.orders, strict=True))
+    times = tuple(np.where(orders > 1.0, _STATIC, own) for own, orders in pairs)
+    return Dynamics(times, tuple(np.minimum(orders, 1.0) for _, orders in pairs), dynamics.delays)
 
 
 def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation]:
@@ -249,22 +297,27 @@ def figures_of(
 
     Times are counted from the step. What is not reached within the record is open above; a response has
     settled when it stays within the band after the record too, to which the overshoot refers as well:
-    `later_at` has the curves at such times, (curves, draws, n) [-].
+    `later_at` has the curves at such times, and at those just after a delay, (curves, draws, n) [-].
     """
     out: list[Metric] = []
     end = float(curves.time[-1])
     after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
-    later = later_at(after)
-    time = np.concatenate((curves.time, after))
+    later, within, normalised = later_at(after), curves.time, curves.normalised
+    early = _onset(curves)
+    if early.size:
+        within = np.concatenate((within, early))
+        order = np.argsort(within)
+        within, normalised = within[order], np.concatenate((normalised, later_at(early)), axis=2)[..., order]
+    time = np.concatenate((within, after))
 
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:
         out.append(Metric(name, unit, values, note))
 
     for i, j, path, unit in layout.paths:
         k = curves.curve_of[i][j]
-        curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
+        curve, whole = normalised[k], np.concatenate((normalised[k], later[k]), axis=1)
         gain = curves.gains[:, i, j]
-        low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+        low, high = crossing(within, curve, 0.1), crossing(within, curve, 0.9)
         settled = settling(time, whole, _SETTLED, until=end)
         unsettled = float(np.mean(np.isinf(settled)))
         note = (
@@ -283,6 +336,21 @@ def figures_of(
         add(f"steady_state[{path}]", unit, gain, note)
     out.extend(_crosstalk(layout, curves))
     return out
+
+
+def _onset(curves: StepCurves) -> Vector:
+    """Times just after the delays at which a fast response is read too; none where every rise lasts many
+    samples."""
+    period = float(curves.time[0])
+    rises = [
+        _difference(crossing(curves.time, one, 0.9), crossing(curves.time, one, 0.1))
+        for one in curves.normalised
+    ]
+    if not any(np.median(rise) < _FAST * period for rise in rises):
+        return np.empty(0)
+    since = period * np.geomspace(_NEAREST, 2 * _FAST, _ONSET_POINTS)
+    times = np.unique(np.median(curves.delays, axis=0)[:, None] + since)
+    return np.asarray(times[times < curves.time[-1]])
 
 
 def _later(table: ParameterTable, curves: StepCurves, time: Vector) -> Array:

@@ -15,7 +15,7 @@ from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.bench.device import Bench, simulate
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.record import Axis, save_record
+from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.fittedrange import FittedRange, energies
 from lcopa_bayes.results.newdrive import fitted_range, predict
@@ -263,6 +263,41 @@ def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
         alone.score(wrong)
     with pytest.raises(InputError, match="is in s, the study is in ms; convert its times"):
         alone.score(replace(HELD, time_unit="s"))
+
+
+@pytest.mark.parametrize("order", [1.02, 1.3, 1.9])
+def test_rows_far_apart_are_predicted_as_close_ones_are(order):
+    """Second method: every twentieth row of a record read closely. On blocks as wide as the rows are apart
+    the response of an order above 1 alternates and grows."""
+    prepared = problem(record(camera=0.2, duration=30.0))
+    values = row_values(prepared.posterior.table, TRUTH | {"order_1": order, "time_1": 0.4})
+    time = 0.1 * np.arange(8_001)
+    drive = np.where((time >= 30.0) & (time < 400.0), 1.0, 0.0)[:, None]
+    axes = (Axis("u", "V"),), (Axis("y", "rad"),)
+    close = Record("close", time, drive, np.zeros((time.size, 1)), *axes, "ms")
+    apart = replace(close, name="apart", time=time[::20], drive=drive[::20], response=close.response[::20])
+    read = [prepared.simulated([one])[1] for one in (close, apart)]
+    table = prepared.posterior.table
+    whole, some = (responses(table, model, values[None])[0][0, 0] for model in read)
+    assert np.abs(whole).max() < 4.0
+    late = time[::20] % 400.0 > 60.0  # a row of the drive holds until the next
+    assert_allclose(some[late], whole[::20][late], atol=2e-3)
+
+
+def test_a_record_that_would_take_millions_of_blocks_is_refused():
+    prepared = problem(record(camera=0.2))
+    time = np.array([0.0, 1.0, 1e7])
+    long = Record(
+        "years",
+        time,
+        np.array([[0.0], [1.0], [1.0]]),
+        np.zeros((3, 1)),
+        (Axis("u", "V"),),
+        (Axis("y", "rad"),),
+        "ms",
+    )
+    with pytest.raises(InputError, match=r"years: lasts 1e\+07 ms, where the fit resolves 0\.\d+ ms"):
+        prepared.simulated([long])
 
 
 def test_a_new_record_may_have_the_name_of_a_fitted_one_but_not_its_samples(alone):

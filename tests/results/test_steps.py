@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.results import steps
 from lcopa_bayes.results.steps import crossing, settling, share_unsettled, step_curves, step_metrics, too_fast
 
 TIME = 20.0 * np.arange(1, 1001) / 1000
@@ -92,6 +93,49 @@ def curves_of(values: dict[str, float], span: float, draws: int = 8):
     posterior = problem(record(camera=0.6), terms=1).posterior
     made = draws_of(posterior.table, np.tile(row_values(posterior.table, values), (draws, 1)))
     return made, step_curves(made, span)
+
+
+@pytest.mark.parametrize("periods", [5.0, 300.0, 3_000.0, 50_000.0])
+@pytest.mark.parametrize("damping", [0.1, 0.4])
+def test_figures_of_a_ringing_plant_do_not_depend_on_how_long_it_is_watched(damping, periods):
+    """Closed forms of second order, over spans of so many time constants: blocks as wide as the samples would
+    leave the response alternating, and a peak between two of these was missed."""
+    time = 0.01
+    values = {"gain": 2.0, "delay": 0.3 * time, "time_1": time, "order_1": 2.0, "order_2": 1.0}
+    values["time_2"] = 2 * damping * time
+    posterior = problem(record(camera=0.6), terms=2).posterior
+    made = draws_of(posterior.table, np.tile(row_values(posterior.table, TRUTH | values), (2, 1)))
+    curves = step_curves(made, (40.0 + periods) * time)
+    shown = {one.name: one.value for one in step_metrics(made, curves, time_unit="ms")}
+    assert shown["overshoot[y]"] == pytest.approx(exp(-pi * damping / sqrt(1 - damping**2)), abs=0.01)
+    dense = np.linspace(0, 4, 400_001)
+    fast, phase = sqrt(1 - damping**2), np.arccos(damping)
+    exact = (1 - np.exp(-damping * dense) * np.sin(fast * dense + phase) / np.sin(phase))[None]
+    rise = (crossing(dense, exact, 0.9) - crossing(dense, exact, 0.1))[0]
+    assert shown["rise_10_90[y]"] == pytest.approx(rise * time, rel=0.01)
+    assert shown["value_at_end[y]"] == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("order", [1.02, 1.3, 1.9])
+def test_a_plant_much_faster_than_the_samples_of_its_response_has_settled(order):
+    made, curves = curves_of(TRUTH | {"order_1": order, "time_1": 1e-3, "delay": 0.0}, 20.0)
+    assert_allclose(curves.normalised[..., 10:], 1.0, atol=0.02)  # from 0.2 ms on, 200 time constants
+    shown = {one.name: one.value for one in step_metrics(made, curves, time_unit="ms")}
+    slow, slower = curves_of(TRUTH | {"order_1": order, "time_1": 1.0, "delay": 0.0}, 200.0)
+    same = {one.name: one.value for one in step_metrics(slow, slower, time_unit="ms")}
+    assert shown["rise_10_90[y]"] == pytest.approx(1e-3 * same["rise_10_90[y]"], rel=0.02)
+    assert shown["overshoot[y]"] == pytest.approx(same["overshoot[y]"], abs=0.01)
+
+
+def test_each_draw_is_read_as_by_itself():
+    """Slow ones among some whose terms end within a millionth of the span."""
+    table = problem(record(camera=0.6), terms=1).posterior.table
+    kinds = [(1.7, 2.0), (1.7, 1e-6), (0.8, 1.5), (1.4, 1e-4), (1.2, 3.0)]
+    rows = [row_values(table, TRUTH | {"order_1": order, "time_1": time}) for order, time in kinds]
+    together = steps.curves_of(table, np.array(rows), 20.0).normalised
+    for k, row in enumerate(rows):
+        alone = steps.curves_of(table, row[None], 20.0).normalised
+        assert_allclose(together[:, k], alone[:, 0], rtol=0, atol=1e-4)
 
 
 def test_curves_are_the_step_response_of_the_plant():
