@@ -35,7 +35,7 @@ constant the response of an order above 1 alternates and grows."""
 _RESOLVED, _RINGING = 1.0, 0.1
 """Width of blocks over the longest time constant of an element of an order just above 1, and of order 2 [-]:
 on much wider ones the response alternates and grows."""
-_MOST = 1 << 17
+_MOST = 1 << 16
 """Blocks of a step response at most [-]."""
 _SETTLED_SPANS = 200.0
 """Time after which what effects add has settled, in spans of the record [-]."""
