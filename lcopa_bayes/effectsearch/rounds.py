@@ -29,7 +29,7 @@ from lcopa_bayes.effectsearch.signature import (
     signature_of,
 )
 from lcopa_bayes.effectsearch.trace import Trace, trace
-from lcopa_bayes.effectsearch.verdict import FIRM, MARGIN
+from lcopa_bayes.effectsearch.verdict import AHEAD, FIRM, MARGIN
 from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
@@ -89,6 +89,15 @@ class Round:
         """Whether that is above what chance gives."""
         return self.trace.alarmed and self.largest > self.trace.threshold
 
+    @property
+    def ahead(self) -> float:
+        """Log evidence of what was chosen over every other effect with a name in its place [nat]; infinite
+        where nothing was, or in place of several at once."""
+        if self.chosen is None:
+            return np.inf
+        others = [one for one in self.refits if one.added != self.chosen.added and not one.dynamics]
+        return self.chosen.log_bayes_factor - max((one.log_bayes_factor for one in others), default=-np.inf)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -126,10 +135,11 @@ class Search:
 
     @property
     def apart(self) -> bool:
-        """Whether every effect brought enough evidence for a firm name and is confounded with no other, and
-        nothing that another name might explain too remains."""
+        """Whether every effect brought enough evidence for a firm name and is confounded with no other, nor
+        nearly, and nothing that another name might explain too remains."""
         alone = all(len(each) == 1 for each in self.groups)
-        return self.brought >= FIRM and alone and not self.rounds[-1].alarmed
+        ahead = min(one.ahead for one in self.rounds)
+        return self.brought >= FIRM and alone and ahead >= AHEAD and not self.rounds[-1].alarmed
 
     @property
     def best(self) -> Refit | None:

@@ -1,6 +1,7 @@
 """What the loop ends with: noise as the last residual has it, internal constants that are not known, and firm
 names."""
 
+import types
 from dataclasses import replace
 
 import numpy as np
@@ -173,3 +174,26 @@ def test_names_are_firm_where_each_brought_enough_and_nothing_remains():
     left = replace(last, trace=replace(last.trace, threshold=-1e3))
     assert not replace(found, rounds=(*found.rounds[:-1], left)).apart
     assert isinstance(found.state, State)
+
+
+def test_a_name_is_firm_where_every_other_is_clearly_behind():
+    """A generic class behind it says nothing of the name, and a pair has groups of its own."""
+    made = bent()
+    base = fitted_base(made, LIBRARY, as_stated=True, draws=400)
+    found = search(
+        base.start, LIBRARY, np.random.default_rng(0), noise_samples=base.fit.noise_samples, draws=400
+    )
+    first, *more = found.rounds
+    assert first.chosen is not None
+
+    def apart(behind: float, dynamics: bool = False) -> bool:
+        assert first.chosen is not None
+        other = types.SimpleNamespace(
+            added=("other",), dynamics=dynamics, log_bayes_factor=first.chosen.log_bayes_factor - behind
+        )
+        return replace(found, rounds=(replace(first, refits=(first.chosen, other)), *more)).apart
+
+    assert [apart(behind) for behind in (5.9, 6.1)] == [False, True]
+    assert apart(4.0, dynamics=True)
+    assert first.ahead > 6.0
+    assert found.rounds[-1].ahead == np.inf
