@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
 from lcopa_bayes.data.settings import ModelSettings
@@ -51,7 +51,7 @@ class Dynamics:
         """With all delays longer by a time, (batch,) [time unit]."""
         return Dynamics(self.times, self.orders, self.delays + by[:, None])
 
-    def __getitem__(self, plants: slice) -> Dynamics:
+    def __getitem__(self, plants: slice | Index) -> Dynamics:
         """Some of the plants."""
         times, orders = (tuple(each[plants] for each in part) for part in (self.times, self.orders))
         return Dynamics(times, orders, self.delays[plants])

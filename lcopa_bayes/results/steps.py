@@ -35,8 +35,9 @@ constant the response of an order above 1 alternates and grows."""
 _RESOLVED, _RINGING = 1.0, 0.1
 """Width of blocks over the longest time constant of an element of an order just above 1, and of order 2 [-]:
 on much wider ones the response alternates and grows."""
-_MOST = 1 << 16
-"""Blocks of a step response at most [-]."""
+_MOST, _ACTED, _CELLS = 1 << 16, 1 << 14, 1 << 20
+"""Blocks of a step response at most, with effects too, and of all draws with these that are simulated at once
+[-]."""
 _SETTLED_SPANS = 200.0
 """Time after which what effects add has settled, in spans of the record [-]."""
 _LATER = 4.0
@@ -121,7 +122,7 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     unit]; NaN where there is no bounded one."""
     effects = table.effects
     assert effects is not None
-    widest = max(float(_resolved(table.dynamics(values)).min()), float(time[-1]) / _MOST)
+    widest = max(float(_resolved(table.dynamics(values)).min()), float(time[-1]) / _ACTED)
     heights, experiments, mesh = effects.ranges.drive, [], Mesh.of_samples(time, 0.0, widest=widest)
     for j, height in enumerate(heights):
         step = AxisDrive(np.zeros(1), np.array([float(height)]))
@@ -130,7 +131,9 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     count = len(experiments)
     over = replace(effects, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
     model = ForwardModel(table.layout, tuple(experiments), over)
-    read = Simulation(table, model).responses(values)
+    simulation, size = Simulation(table, model), max(1, _CELLS // mesh.grid.n)
+    parts = [simulation.responses(values[at : at + size]) for at in range(0, len(values), size)]
+    read = [np.concatenate(each, axis=1) for each in zip(*parts, strict=True)]
     by_drive = [one / height for one, height in zip(read, heights, strict=True)]
     return np.concatenate(list(np.stack(by_drive, axis=1)))
 
@@ -148,7 +151,7 @@ def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
         rows = np.flatnonzero(decades == decade)
         rows = rows[np.argsort(widths[rows], kind="stable")]
         for some in np.array_split(rows, max(1, rows.size // 64)):
-            part, widest = table.dynamics(values[some]), float(widths[some].min())
+            part, widest = dynamics[some], float(widths[some].min())
             begin = int(np.searchsorted(time, _MOST * widest))
             if begin:
                 out[:, some, :begin] = _stepped(table.layout, part, time[:begin], widest)

@@ -15,6 +15,7 @@ from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.settings import EffectsSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.results import steps
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.frequency import frequency_response
 from lcopa_bayes.results.newdrive import predict
@@ -76,6 +77,18 @@ def test_steady_state_of_a_stiff_plant(stiff: tuple[Fit, np.ndarray], order: flo
     assert reported["steady_state[y]"].value == pytest.approx(level / ranges.drive[0], rel=1e-4)
     if order is None:
         assert reported["value_at_end[y]"].value < reported["steady_state[y]"].value
+
+
+def test_curves_do_not_depend_on_how_many_draws_are_simulated_at_once(
+    stiff: tuple[Fit, np.ndarray], monkeypatch: pytest.MonkeyPatch
+):
+    found, _ = stiff
+    values = found.draws.flat[:: len(found.draws.flat) // 5][:5]
+    whole = steps.curves_of(found.draws.table, values, 10.0)
+    monkeypatch.setattr(steps, "_CELLS", 1)
+    each = steps.curves_of(found.draws.table, values, 10.0)
+    assert_allclose(each.normalised, whole.normalised, rtol=0, atol=1e-6)
+    assert_allclose(each.gains, whole.gains, rtol=1e-6)
 
 
 @pytest.mark.parametrize("order", [0.4, 1.02, 1.95])
