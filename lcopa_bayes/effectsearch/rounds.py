@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self, final
+from functools import cached_property
+from typing import NamedTuple, Self, final
 
 import numpy as np
 
@@ -106,8 +107,9 @@ class Search:
 
     rounds: tuple[Round, ...]
     state: State
-    groups: tuple[tuple[str, ...], ...]
-    """For each effect of the state, the names it is confounded with, its own first."""
+    confounded: Callable[[], Mapping[str, tuple[str, ...]]]
+    """Works out the names that each effect is confounded with: of several that were added at once it takes as
+    long as their search, and only who names them has to know."""
     gained: float
     """Log evidence of the final model over the base model [nat]."""
     share: float
@@ -118,10 +120,9 @@ class Search:
     infinite without any."""
 
     @classmethod
-    def ending(cls, rounds: Sequence[Round], groups: Mapping[str, tuple[str, ...]]) -> Self:
+    def ending(cls, rounds: Sequence[Round], confounded: Callable[[], Mapping[str, tuple[str, ...]]]) -> Self:
         """With what the last round looked at."""
         start, state, last = rounds[0].state, rounds[-1].state, rounds[-1]
-        confounded = (groups.get(effect.name, (effect.name,)) for effect in state.model.effects)
         scale = last.trace.scale
         gained, dropped = evidence_over(start, state, scale.quiet)
         left = scale.drop(last.largest) if last.alarmed else 0.0
@@ -131,15 +132,21 @@ class Search:
         worth = [one.log_bayes_factor for one in added if present.issuperset(one.added)]
         worth += _beside_others(state, scale.quiet)
         least = min(worth, default=np.inf)
-        return cls(tuple(rounds), state, tuple(confounded), gained, share, least)
+        return cls(tuple(rounds), state, confounded, gained, share, least)
+
+    @cached_property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """For each effect of the state, the names it is confounded with, its own first."""
+        known = self.confounded()
+        return tuple(known.get(effect.name, (effect.name,)) for effect in self.state.model.effects)
 
     @property
     def apart(self) -> bool:
         """Whether every effect brought enough evidence for a firm name and is confounded with no other, nor
         nearly, and nothing that another name might explain too remains."""
-        alone = all(len(each) == 1 for each in self.groups)
         ahead = min(one.ahead for one in self.rounds)
-        return self.brought >= FIRM and alone and ahead >= AHEAD and not self.rounds[-1].alarmed
+        clear = self.brought >= FIRM and ahead >= AHEAD and not self.rounds[-1].alarmed
+        return clear and all(len(each) == 1 for each in self.groups)
 
     @property
     def best(self) -> Refit | None:
@@ -180,18 +187,19 @@ def search(
         seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
         return Round(state, seen)
 
-    rounds, groups = _one_by_one(first or looking(start), looking, crew, alone=alone)
+    rounds = _one_by_one(first or looking(start), looking, crew, alone=alone)
     if rounds[-1].alarmed and not alone:
-        rounds, groups = _past_generic(rounds, groups, looking, crew)
+        rounds = _past_generic(rounds, looking, crew)
     while rounds[-1].alarmed and len(rounds) > 1 and rounds[-2].state.model.effects:
         if better(rounds[-1].state, rounds[-2].state):
             break
         rounds[-2:] = [replace(rounds[-2], chosen=None)]
     unnamed = any(effect.card.dynamics for effect in rounds[-1].state.model.effects)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
-        further, confounded = _pair(rounds[0], rounds[-1].state, looking, better, crew)
-        rounds, groups = rounds + further, confounded if further else groups
-    return Search.ending(rounds, groups)
+        pair = _pair(rounds[0], rounds[-1].state, looking, better)
+        if pair is not None:
+            return Search.ending([*rounds, *pair.rounds], lambda: _groups(pair.kept, looking, crew))
+    return Search.ending(rounds, lambda: _groups_one_by_one(rounds))
 
 
 def _one_by_one(
@@ -202,14 +210,14 @@ def _one_by_one(
     alone: bool,
     before: Sequence[Round] = (),
     generic: bool = True,
-) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
-    """Rounds `before` and those that each add an effect but the last, and the names that each effect added
-    here is confounded with; only effects ahead of any `generic` class, unless that is no rival."""
-    look, rounds, groups = first, list(before), dict[str, tuple[str, ...]]()
+) -> list[Round]:
+    """Rounds `before` and those that each add an effect but the last; only effects ahead of any `generic`
+    class, unless that is no rival."""
+    look, rounds = first, list(before)
     while True:
         seen, state, number = look.trace, look.state, len(rounds)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
-            return [*rounds, Round(state, seen)], groups
+            return [*rounds, Round(state, seen)]
         beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
         crew.stage(f"refitting with each effect that comes into question{beside}")
         look = look.refitted(crew)
@@ -218,52 +226,60 @@ def _one_by_one(
         allowed = accepted(look.refits, seen, bar, generic=generic)
         likely = [one for one in allowed if not alone or large(one)]
         chosen = leader(beside_dynamics(likely, [one for one in look.refits if one.dynamics]))
-        if chosen is not None and chosen.dynamics and (groups or before):
+        named = any(not effect.card.dynamics for effect in state.model.effects)
+        if chosen is not None and chosen.dynamics and (named or before):
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
         rounds.append(replace(look, chosen=chosen))
         if chosen is None:
-            return rounds, groups
-        if not chosen.dynamics:
-            groups[chosen.added[0]] = group(state, chosen, look.refits, seen)
+            return rounds
         look = looking(in_proportion(_kept(chosen)))
 
 
-def _past_generic(
-    rounds: list[Round], groups: dict[str, tuple[str, ...]], looking: Callable[[State], Round], crew: Crew
-) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
+def _past_generic(rounds: list[Round], looking: Callable[[State], Round], crew: Crew) -> list[Round]:
     """Rounds that go on where a generic class was ahead of every effect, if the effects they add have more
     evidence than that class together; else the same `rounds`.
 
     A generic class describes what several effects leave better than any one of them does.
     """
     last = rounds[-1]
-    further, more = _one_by_one(last, looking, crew, alone=False, before=rounds[:-1], generic=False)
+    further = _one_by_one(last, looking, crew, alone=False, before=rounds[:-1], generic=False)
     if len(further) == len(rounds):
-        return rounds, groups
+        return rounds
     gained, _ = evidence_over(last.state, further[-1].state, last.trace.scale.quiet)
     ahead = last.trace.generic is None or gained > last.trace.generic.log_bayes_factor + MARGIN
-    return (further, groups | more) if ahead else (rounds, groups)
+    return further if ahead else rounds
+
+
+def _groups_one_by_one(rounds: Sequence[Round]) -> dict[str, tuple[str, ...]]:
+    """Names that each effect which was added by itself is confounded with."""
+    added = ((one, one.chosen) for one in rounds if one.chosen is not None and not one.chosen.dynamics)
+    return {chosen.added[0]: group(one.state, chosen, one.refits, one.trace) for one, chosen in added}
+
+
+@final
+class _Paired(NamedTuple):
+    """A pair of effects, or the one of them that does as well alone."""
+
+    kept: Refit
+    rounds: tuple[Round, Round]
+    """That adds it, and the look at what it leaves."""
 
 
 def _pair(
-    first: Round,
-    state: State,
-    looking: Callable[[State], Round],
-    better: Callable[[State, State], bool],
-    crew: Crew,
-) -> tuple[list[Round], dict[str, tuple[str, ...]]]:
-    """Rounds that add a pair of effects at once to what the `first` looked at, where that beats a `state`
-    with effects that were found one by one, and the names that each is confounded with; else none."""
+    first: Round, state: State, looking: Callable[[State], Round], better: Callable[[State, State], bool]
+) -> _Paired | None:
+    """A pair of effects added at once to what the `first` round looked at, where that beats a `state` with
+    effects that were found one by one; else None."""
     pair = paired(first.state, state, first.trace)
     if pair is None:
-        return [], {}
+        return None
     look = looking(in_proportion(pair.state))
     kept = both(first.state, state, pair, better) if look.alarmed else pair
     if kept is None:
-        return [], {}
+        return None
     if kept is not pair:
         look = looking(in_proportion(kept.state))
-    return [replace(first, refits=(kept,), failures=(), chosen=kept), look], _groups(kept, looking, crew)
+    return _Paired(kept, (replace(first, refits=(kept,), failures=(), chosen=kept), look))
 
 
 def _groups(chosen: Refit, looking: Callable[[State], Round], crew: Crew) -> dict[str, tuple[str, ...]]:

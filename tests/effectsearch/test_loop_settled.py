@@ -3,6 +3,7 @@ names."""
 
 import types
 from dataclasses import replace
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -172,7 +173,17 @@ def test_names_are_firm_where_each_brought_enough_and_nothing_remains():
     assert not replace(found, brought=29.0).apart
     last = found.rounds[-1]
     left = replace(last, trace=replace(last.trace, threshold=-1e3))
-    assert not replace(found, rounds=(*found.rounds[:-1], left)).apart
+
+    def asked() -> NoReturn:
+        raise AssertionError
+
+    remains = replace(found, rounds=(*found.rounds[:-1], left), confounded=asked)
+    assert not remains.apart  # nothing has to be refitted to know that
+    with pytest.raises(AssertionError):
+        assert replace(found, confounded=asked).apart
+    shared = replace(found, confounded=lambda: {"odd_curvature": ("odd_curvature", "twin")})
+    assert shared.groups == (("odd_curvature", "twin"),)
+    assert not shared.apart
     assert isinstance(found.state, State)
 
 
