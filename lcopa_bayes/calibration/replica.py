@@ -29,7 +29,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.discretisation import discretisation, resolved
 from lcopa_bayes.results.prediction import responses
-from lcopa_bayes.results.steps import StepCurves, curves_of, step_curves
+from lcopa_bayes.results.stepcurves import StepCurves, curves_of, step_curves
 from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.run import SamplePlan

@@ -27,7 +27,7 @@ from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.layout import Layout, PathSlot
-from lcopa_bayes.results.steps import curves_of, step_times
+from lcopa_bayes.results.stepcurves import curves_of, step_times
 from lcopa_bayes.results.sumsoflags import (
     Alternative,
     FittedPlant,

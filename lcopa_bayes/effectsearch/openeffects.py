@@ -34,7 +34,8 @@ from lcopa_bayes.effectsearch.trace import Trace, worth
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
 from lcopa_bayes.results.averages import parts_of_sd, pooled, pooled_parts
-from lcopa_bayes.results.steps import curves_of, metrics_of
+from lcopa_bayes.results.stepcurves import curves_of
+from lcopa_bayes.results.steps import metrics_of
 
 LEAST = 3e-3
 """Weight beside that of the final model below which an alternative is left out [-]."""

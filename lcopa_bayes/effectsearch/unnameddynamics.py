@@ -26,7 +26,8 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.results.steps import curves_of, metrics_of
+from lcopa_bayes.results.stepcurves import curves_of
+from lcopa_bayes.results.steps import metrics_of
 
 
 @final

@@ -15,7 +15,8 @@ from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.results.sensitivity import Sensitivity
-from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics
+from lcopa_bayes.results.stepcurves import StepCurves, step_curves
+from lcopa_bayes.results.steps import step_metrics
 from lcopa_bayes.sampling.draws import Draws
 
 FACTOR = 2.0

@@ -36,7 +36,8 @@ from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, prove
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
-from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too_fast
+from lcopa_bayes.results.stepcurves import StepCurves, step_curves
+from lcopa_bayes.results.steps import step_metrics, too_fast
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck

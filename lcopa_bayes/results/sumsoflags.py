@@ -30,7 +30,8 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.layout import Layout, PathSlot
-from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
+from lcopa_bayes.results.stepcurves import StepCurves
+from lcopa_bayes.results.steps import Metric, figures_of
 from lcopa_bayes.sampling.lagdraws import LagDraws, LagMixture, lag_draws, lag_tasks
 
 _SUPPORT = 10.0

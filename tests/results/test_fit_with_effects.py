@@ -15,12 +15,13 @@ from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.settings import EffectsSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results import steps
+from lcopa_bayes.results import stepcurves
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.frequency import frequency_response
 from lcopa_bayes.results.newdrive import predict
 from lcopa_bayes.results.prediction import bands
-from lcopa_bayes.results.steps import step_curves, step_metrics
+from lcopa_bayes.results.stepcurves import step_curves
+from lcopa_bayes.results.steps import step_metrics
 
 TRUTH = {"gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
 
@@ -84,9 +85,9 @@ def test_curves_do_not_depend_on_how_many_draws_are_simulated_at_once(
 ):
     found, _ = stiff
     values = found.draws.flat[:: len(found.draws.flat) // 5][:5]
-    whole = steps.curves_of(found.draws.table, values, 10.0)
-    monkeypatch.setattr(steps, "_CELLS", 1)
-    each = steps.curves_of(found.draws.table, values, 10.0)
+    whole = stepcurves.curves_of(found.draws.table, values, 10.0)
+    monkeypatch.setattr(stepcurves, "_CELLS", 1)
+    each = stepcurves.curves_of(found.draws.table, values, 10.0)
     assert_allclose(each.normalised, whole.normalised, rtol=0, atol=1e-6)
     assert_allclose(each.gains, whole.gains, rtol=1e-6)
 

@@ -14,8 +14,9 @@ from numpy.testing import assert_allclose
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.core.estimate import Estimate
-from lcopa_bayes.results import steps
-from lcopa_bayes.results.steps import crossing, settling, share_unsettled, step_curves, step_metrics, too_fast
+from lcopa_bayes.results import stepcurves
+from lcopa_bayes.results.stepcurves import step_curves
+from lcopa_bayes.results.steps import crossing, settling, share_unsettled, step_metrics, too_fast
 
 TIME = 20.0 * np.arange(1, 1001) / 1000
 STEP = TIME[1] - TIME[0]
@@ -132,9 +133,9 @@ def test_each_draw_is_read_as_by_itself():
     table = problem(record(camera=0.6), terms=1).posterior.table
     kinds = [(1.7, 2.0), (1.7, 1e-6), (0.8, 1.5), (1.4, 1e-4), (1.2, 3.0)]
     rows = [row_values(table, TRUTH | {"order_1": order, "time_1": time}) for order, time in kinds]
-    together = steps.curves_of(table, np.array(rows), 20.0).normalised
+    together = stepcurves.curves_of(table, np.array(rows), 20.0).normalised
     for k, row in enumerate(rows):
-        alone = steps.curves_of(table, row[None], 20.0).normalised
+        alone = stepcurves.curves_of(table, row[None], 20.0).normalised
         assert_allclose(together[:, k], alone[:, 0], rtol=0, atol=1e-4)
 
 
