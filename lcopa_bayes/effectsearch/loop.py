@@ -196,7 +196,7 @@ class _Begun:
 
     def search(self, options: _Options) -> tuple[Self, Search]:
         """All rounds, and the base fit on blocks as narrow as the effects that these added ask for; searched
-        again there where something remains, which wide blocks may have left."""
+        again there where wide blocks left a part of what remains."""
         searched = self._rounds(options)
         problem, state = self.base.problem, searched.state
         if not state.model.effects:
@@ -208,7 +208,7 @@ class _Begun:
             begun, state = replace(self, base=self.base.on(narrow)), moved(state, narrow)
         except ArithmeticError:  # no bounded response on narrower blocks
             return self, searched
-        if not searched.rounds[-1].alarmed:
+        if not searched.left_by_blocks(state):
             return begun, replace(searched, state=state)
         options.crew.stage("searching again on narrower blocks, which the effects ask for")
         return begun.search(options)

@@ -38,6 +38,8 @@ MOST = 3
 _STEPS = 3
 """Steps to deflections that a plant fitted with them has [-]: where one was wrong by a fifth each leaves a
 third of the error."""
+_PART = 0.2
+"""Share of what remains from which that is for the width of the blocks to explain [-]."""
 _SLIGHT = 0.1
 """Squared change of a response that moves no parameter by more than a third of its sd [variance of the
 noise]."""
@@ -112,9 +114,10 @@ class Search:
     long as their search, and only who names them has to know."""
     gained: float
     """Log evidence of the final model over the base model [nat]."""
-    share: float
-    """Half the residual power that the effects took, over that and what the best class left would
-    take [-]."""
+    dropped: float
+    """Half the residual power that the effects took [-]."""
+    left: float
+    """What the best class that is left would take of it; 0 where nothing significant remains [-]."""
     brought: float
     """Least log evidence that one of the effects brought, when it was added or beside the others [nat];
     infinite without any."""
@@ -126,13 +129,22 @@ class Search:
         scale = last.trace.scale
         gained, dropped = evidence_over(start, state, scale.quiet)
         left = scale.drop(last.largest) if last.alarmed else 0.0
-        share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
         present = {effect.name for effect in state.model.effects}
         added = (one.chosen for one in rounds if one.chosen is not None)
         worth = [one.log_bayes_factor for one in added if present.issuperset(one.added)]
         worth += _beside_others(state, scale.quiet)
         least = min(worth, default=np.inf)
-        return cls(tuple(rounds), state, confounded, gained, share, least)
+        return cls(tuple(rounds), state, confounded, gained, dropped, left, least)
+
+    @property
+    def share(self) -> float:
+        """What the effects took of the residual power, over that and what is left [-]."""
+        return self.dropped / (self.dropped + self.left) if self.dropped > 0 else float(self.left <= 0)
+
+    def left_by_blocks(self, narrower: State) -> bool:
+        """Whether a part of what is left comes from blocks that are wide: so much the residual changes on
+        `narrower` ones, at the optimum there."""
+        return abs(self.state.optimum.cost - narrower.optimum.cost) > _PART * self.left > 0.0
 
     @cached_property
     def groups(self) -> tuple[tuple[str, ...], ...]:

@@ -12,10 +12,11 @@ from small import TRUTH, problem, record, row_values, study
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.loop import _Begun, loop
 from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.resolvedmodel import moved, narrowed_for
+from lcopa_bayes.effectsearch.rounds import Search
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
@@ -76,4 +77,39 @@ def test_a_loop_ends_on_the_blocks_that_its_effects_ask_for():
     assert found.base.optimum is found.before.state.optimum
     model = found.after.state.model
     assert model.plant.model is found.problem.posterior.model
+    assert off(found.after.state) < 3.0
+
+
+def test_only_what_the_width_of_blocks_may_have_left_is_searched_for_again(wide):
+    """On narrower blocks the residual loses 12 nat or more."""
+    state, own = wide
+    found = moved(state, narrowed_for(state, own))
+    lost = state.optimum.cost - found.optimum.cost
+    searched = Search((), state, dict, gained=0.0, dropped=3.0 * lost, left=lost, brought=np.inf)
+    assert searched.share == 0.75
+    assert [replace(searched, left=left * lost).left_by_blocks(found) for left in (0, 4.9, 5.1)] == [
+        False,
+        True,
+        False,
+    ]
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_search_is_repeated_once_where_that_is_so(blocks: bool, monkeypatch):
+    """As often as the blocks get narrower, which is once."""
+    searched, asked, inner = [], [], _Begun._rounds
+
+    def left_by_blocks(search: Search, narrower: State) -> bool:
+        asked.append(search.state.optimum.cost - narrower.optimum.cost)
+        return blocks
+
+    monkeypatch.setattr(Search, "left_by_blocks", left_by_blocks)
+    monkeypatch.setattr(_Begun, "_rounds", lambda begun, how: searched.append(begun) or inner(begun, how))
+    seen, unseen = asymmetric(1, [1.0, -0.7, 0.4, 0.0]), asymmetric(3, [0.8, -1.0, 0.2, 0.9])
+    own = study(seen, held_out=[unseen], blocks=100)
+    found = loop(own, library=[RiseFallAsymmetry], sample=False, quick=True, as_stated=True)
+    assert found.problem.refinement > 1
+    assert len(searched) == (2 if blocks else 1)
+    assert asked[0] > 5.0
+    assert len(asked) == 1
     assert off(found.after.state) < 3.0
