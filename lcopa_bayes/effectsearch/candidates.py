@@ -7,7 +7,7 @@ instances are chosen by descents of the whole model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from typing import TypeAlias
@@ -16,8 +16,9 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
+from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.refits import Refit, refit, under_one_noise
+from lcopa_bayes.effectsearch.refits import Refit, begun, ended, under_one_noise
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Signature
@@ -39,8 +40,11 @@ _INSTANCES = 16
 _FORCED = 3
 """The same beside a force that is already there, and of linear dynamics [-]."""
 _REACH = 0.5
-"""Share of the evidence of a rival below which a first descent is not followed further [-]: the rest of a
-refit does not double it."""
+"""Share of the evidence of a rival below which a refit is not taken to its end [-]: the rest does not double
+it."""
+_BEHIND, _FAR_BEHIND = 0.3, 30.0
+"""What a few evaluations are worth over the best one's [-], and how far behind that [nat], below which a
+refit is not taken to its end: in 13 searches the rest added a third of the best at most."""
 _OTHER = 0.9
 """Cosine between signatures below which an instance of an effect is another [-]."""
 _GLANCE, _FOLLOWED, _STEPS = 3, 8, 12
@@ -69,7 +73,8 @@ def refitted(
 
     Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
     from the size of their prior. So are the classes of linear dynamics, which a name must beat, if any name
-    reaches a `rival` [nat]. What a first descent leaves far below that is not refitted to the end.
+    reaches a `rival` [nat]. What a few evaluations leave far below that, or below the best candidate, is not
+    refitted to the end: its evidence is a lower bound.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
     worth = {one.name: one.signature for one in named if one.log_bayes_factor > 0}
@@ -90,23 +95,46 @@ def refitted(
         if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
             worth[one.name] = one.signature
             sizes[one.name] = worth[one.name].amplitude(seen.residual, seen.scale)
-    known = crew.sharing((state, least if seen.alarmed else np.inf, far, _REACH * rival))
+    known = crew.sharing((state, least if seen.alarmed else np.inf, far))
     # of the trace a task needs one effect
     tasks = {name: (replace(seen, traced=(seen.of(name),)), size) for name, size in sizes.items()}
-    dynamics = {name: task for name, task in tasks.items() if seen.of(name).card.dynamics}
-    names = {name: task for name, task in tasks.items() if name not in dynamics}
-    ends = dict(zip(names, known.each(_refitted, list(names.values())), strict=True))
-    evidences = [end.log_bayes_factor for end in ends.values() if isinstance(end, Refit)]
-    if rival == -np.inf or state.whitening.dependence or any(one >= rival for one in evidences):
-        ends |= zip(dynamics, known.each(_refitted, list(dynamics.values())), strict=True)
+    several = [name for name in tasks if not seen.of(name).card.dynamics]
+    dynamics = [name for name in tasks if name not in several]
+    if rival == -np.inf or state.whitening.dependence:
+        several, dynamics = several + dynamics, []
+    ends = _raced(known, {name: tasks[name] for name in several}, _REACH * rival)
+    if any(isinstance(end, Refit) and end.log_bayes_factor >= rival for end in ends.values()):
+        ends |= _raced(known, {name: tasks[name] for name in dynamics}, _REACH * rival)
     done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
     failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
     return under_one_noise(done), failures
 
 
-def _refitted(known: tuple[State, float, bool, float], task: tuple[Trace, Vector]) -> Refit | str:
-    """The refit of the only effect of a trace, or why there is none."""
-    (state, least, far, reach), (seen, amplitude) = known, task
+def _raced(
+    known: Workers[tuple[State, float, bool]], tasks: Mapping[str, tuple[Trace, Vector]], least: float
+) -> dict[str, Refit | str]:
+    """The refit of each effect, to the end where a few evaluations leave it near the best and above a `least`
+    evidence [nat], or why there is none."""
+    starts = dict(zip(tasks, known.each(_begun, list(tasks.values())), strict=True))
+    best = max((one.worth for own in starts.values() for one in own if isinstance(one, Refit)), default=0.0)
+    bar = max(least, min(_BEHIND * best, best - _FAR_BEHIND))
+    return dict(zip(starts, known.each(_ended, [(own, bar) for own in starts.values()]), strict=True))
+
+
+def followed(state: State, refits: Sequence[Refit], crew: Crew = ALONE) -> list[Refit]:
+    """All of these refits of a state at their optima, by falling evidence."""
+    ends = crew.sharing(state).each(_followed, list(refits))
+    return under_one_noise([_beside(state, one) for one in ends])
+
+
+def _followed(state: State, one: Refit) -> Refit:
+    return ended(one)
+
+
+def _begun(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> list[Refit] | str:
+    """Refits of the only effect of a trace, one of each instance that comes into question, which are only
+    begun, or why there is none."""
+    (state, least, far), (seen, amplitude) = known, task
     (traced,) = seen.traced
     effect, reached_at = traced.signature.effect, None
     base, quiet = (state.model, state.optimum, state.whitening), seen.scale.quiet
@@ -123,13 +151,25 @@ def _refitted(known: tuple[State, float, bool, float], task: tuple[Trace, Vector
         if other is not None:
             against = (seen.residual, seen.scale)
             starts.append((other.effect, other.amplitude(*against), other.drop(*against)))
-        ends = [
-            refit(*base, [(one, size)], quiet, near=reached_at, least=reach, promised=worth)
-            for one, size, worth in starts
+        return [
+            begun(*base, [(one, size)], quiet, near=reached_at, promised=worth) for one, size, worth in starts
         ]
     except ArithmeticError as error:
         return str(error)
-    return min(ends, key=lambda end: end.optimum.cost)
+
+
+def _ended(known: tuple[State, float, bool], task: tuple[list[Refit] | str, float]) -> Refit | str:
+    """The best of the refits of an effect, at its optimum where it is worth as much as a bar [nat] or noise
+    is fitted jointly."""
+    (state, *_), (starts, bar) = known, task
+    if isinstance(starts, str):
+        return starts
+    ends = [_beside(state, one) for one in starts]
+    near = [one for one in ends if one.worth >= bar or state.whitening.dependence]
+    try:
+        return min([ended(one) for one in near] or ends, key=lambda end: end.optimum.cost)
+    except ArithmeticError as error:
+        return str(error)
 
 
 def _beside(state: State, end: Refit) -> Refit:

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from lcopa_bayes.effectsearch.acceptance import acceptable
-from lcopa_bayes.effectsearch.refits import Refit, evidence_over, refit, under_one_noise
+from lcopa_bayes.effectsearch.refits import Refit, begun, ended, evidence_over, refit, under_one_noise
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import pair_evidence
 from lcopa_bayes.effectsearch.trace import Trace
@@ -19,6 +19,8 @@ _PAIRED = 8
 """Single effects of which pairs are formed [-]."""
 _PAIRS = 2
 """Pairs refitted [-]."""
+_HALFWAY = 0.5
+"""What a few evaluations of a pair are worth over the evidence to beat, below which it is left out [-]."""
 
 
 def paired(start: State, state: State, seen: Trace) -> Refit | None:
@@ -43,7 +45,10 @@ def paired(start: State, state: State, seen: Trace) -> Refit | None:
         sizes = np.split(inner, [pair[0].signature.columns.shape[1]])
         added = [(one.signature.effect, size) for one, size in zip(pair, sizes, strict=True)]
         try:
-            candidate = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
+            candidate = begun(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
+            if candidate.worth < _HALFWAY * bar and not start.whitening.dependence:
+                continue
+            candidate = ended(candidate)
         except ArithmeticError:
             continue
         candidate = replace(under_one_noise([candidate])[0], choice=choice)

@@ -18,7 +18,7 @@ from lcopa_bayes.effectsearch.freedconstants import freed
 from lcopa_bayes.effectsearch.leavingout import groups, log_scores
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.priorwidth import rarity, widened, with_room
-from lcopa_bayes.effectsearch.regression import Optimum, Regression
+from lcopa_bayes.effectsearch.regression import Glance, Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -56,6 +56,9 @@ class Refit:
     """Samples the noise scale is known from [-]."""
     choice: float = 0.0
     """What the evidence pays for a choice among pairs [nat]."""
+    glances: tuple[Glance, ...] = ()
+    """Where a few evaluations from its starts ended, the best of which stands for the optimum of a refit that
+    was only begun; none of a refit at its optimum."""
 
     @cached_property
     def log_bayes_factor(self) -> float:
@@ -74,6 +77,17 @@ class Refit:
         now, was = (log_scores(optimum, apart) for optimum in (self.optimum, self.before))
         known = np.isfinite(now) | np.isfinite(was)  # what others determine for neither says nothing
         return float((now[known] - was[known]).sum())
+
+    @property
+    def worth(self) -> float:
+        """What it takes off the squared residual, without what evidence pays for new coefficients [nat]."""
+        return self.worth_at(self.optimum.cost)
+
+    def worth_at(self, cost: float) -> float:
+        """The same at another cost than that of its optimum [nat]."""
+        freedom = self.whitening.effective - self.optimum.x.size
+        known = Scale(self.quiet, freedom, np.array([2 * self.before.cost]))
+        return float(known.gain(np.array([self.before.cost - cost]))[0])
 
     @property
     def state(self) -> State:
@@ -135,7 +149,7 @@ class Refit:
         optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
         optimum = _no_worse(self.model, whitening, optimum, before)
         model, optimum = with_room(self.model, optimum, whitening, self.added)
-        return replace(self, model=model, optimum=optimum, before=before, whitening=whitening)
+        return replace(self, model=model, optimum=optimum, before=before, whitening=whitening, glances=())
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero, over all noise that is plausible [-]."""
@@ -228,19 +242,28 @@ def refit(
     added: Sequence[tuple[Effect, Vector]],
     quiet: float,
     near: Vector | None = None,
-    least: float = -np.inf,
+) -> Refit:
+    """With effects added to those of `model`, at the optimum; arguments and errors as of `begun`."""
+    return ended(begun(model, before, whitening, added, quiet, near))
+
+
+def begun(
+    model: ExtendedModel,
+    before: Optimum,
+    whitening: Whitening,
+    added: Sequence[tuple[Effect, Vector]],
+    quiet: float,
+    near: Vector | None = None,
     promised: float = np.inf,
 ) -> Refit:
-    """With effects added to those of `model`, each started from zero and from its linear estimate.
+    """With effects added to those of `model`, after a few evaluations from zero and from its linear estimate
+    each, by the plant's own tangents.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
-    noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then frees the
-    effects' internal constants too (`freed`), and ends with the tangents of the whole. The evidence pays
-    for the choice among the instances that were tried. `near` are coordinates to start from first. Where the
-    first start takes nearly as much off half the squared residual as a linear estimate has `promised`, there
-    is no other.
-    ArithmeticError when no start has a bounded response, or what the first descent takes off the residual is
-    worth less than `least` [nat].
+    noise scale is known from (`Scale`). The evidence pays for the choice among the instances that were
+    tried. `near` are coordinates to start from first. Where the first start takes nearly as much off half
+    the squared residual as a linear estimate has `promised`, there is no other.
+    ArithmeticError when no start has a bounded response.
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     size = sum(psi.size for _, psi in added)
@@ -253,18 +276,26 @@ def refit(
     starts = [near, *starts] if near is not None else starts
     starts = [np.clip(start, low, high) for start in starts]  # starts only
     first = Regression(replace(extended, exact=False), whitening)
-    quick, _ = first.lowest(starts, gain=_NEAR, enough=before.cost - _KEPT * promised)
-    scale = Scale(quiet, whitening.effective - quick.size, np.array([2 * before.cost]))
-    worth = float(scale.gain(np.array([before.cost - first.cost(quick)]))[0])
-    if worth < least:
-        raise ArithmeticError(f"a first descent is worth {worth:.3g} nat, where {least:.3g} or more count")
-    names, start = tuple(effect.name for effect, _ in added), quick
-    if worth > _SLIGHT or whitening.dependence:  # noise known from residuals alone holds the effect too
-        extended, start = freed(extended, quick, whitening, names)
-    optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
-    optimum = _no_worse(extended, whitening, optimum, before)
-    extended, optimum = with_room(extended, optimum, whitening, names)
-    return Refit(extended, optimum, before, whitening, names, quiet)
+    glances = first.glanced(starts, gain=_NEAR, enough=before.cost - _KEPT * promised)
+    names, optimum = tuple(effect.name for effect, _ in added), first.at(glances[0].x)
+    return Refit(extended, optimum, before, whitening, names, quiet, glances=glances[:2])
+
+
+def ended(one: Refit) -> Refit:
+    """A refit at its optimum: it goes on by the plant's own tangents, then frees the effects' internal
+    constants too (`freed`), and ends with the tangents of the whole."""
+    if not one.glances:
+        return one
+    model, before, white, names = one.model, one.before, one.whitening, one.added
+    first = Regression(replace(model, exact=False), white)
+    start, _ = first.followed(one.glances, gain=_NEAR)
+    if (
+        one.worth_at(first.cost(start)) > _SLIGHT or white.dependence
+    ):  # noise known from residuals alone holds the effect too
+        model, start = freed(model, start, white, names)
+    optimum = Regression(model, white).descend(start, most=12, gain=0.02)
+    model, optimum = with_room(model, _no_worse(model, white, optimum, before), white, names)
+    return replace(one, model=model, optimum=optimum, glances=())
 
 
 def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:

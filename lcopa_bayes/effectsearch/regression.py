@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -202,50 +202,59 @@ class Regression:
         """Of the log density at a described point, (k,) [nat / coordinate]."""
         return self._slope(at.x, at.white, at.jacobian)
 
-    def lowest(
+    def glanced(
         self, starts: Sequence[Vector], *, gain: float = GAIN, enough: float = -np.inf, crew: Crew = ALONE
-    ) -> tuple[Vector, bool]:
-        """`reached` from the best of several starts: a few evaluations from each, the best two taken to the
-        end. Where a cost is `enough` [nat] the first is taken to the end before the others, and alone if it
-        reaches that.
+    ) -> tuple[Glance, ...]:
+        """Where a few evaluations from each of several starts end, by rising cost; from the first alone where
+        that is `enough` [nat].
 
         ArithmeticError when no start has a finite response.
         """
-        known = []
-        if enough > -np.inf:
-            alone = _glance(_EVALUATIONS, gain, self, starts[0])
-            if alone is not None and alone[0] <= enough:
-                return alone[1:]
-            known, starts = [alone], starts[1:]
-        several, most = crew.sharing(self), _GLANCE if len(starts) > 1 else _EVALUATIONS
-        glances = several.each(partial(_glance, most, gain), starts)
-        looked = [one for one in [*known, *glances] if one is not None]
-        if not looked:
+        first = _glance(gain, self, starts[0]) if enough > -np.inf else None
+        if first is not None and first.cost <= enough:
+            return (first,)
+        others = starts[1:] if enough > -np.inf else starts
+        every = [first, *crew.sharing(self).each(partial(_glance, gain), others)]
+        out = [one for one in every if one is not None]
+        if not out:
             raise FloatingPointError("the simulated response is not finite at any start")
-        looked.sort(key=lambda one: one[0])
-        ends = list(several.each(partial(_end, gain), [x for _, x, _ in looked[:2]]))
+        return tuple(sorted(out, key=lambda one: one.cost))
+
+    def followed(
+        self, glances: Sequence[Glance], *, gain: float = GAIN, crew: Crew = ALONE
+    ) -> tuple[Vector, bool]:
+        """`reached` from the best of several glances: the best two are taken to the end."""
+        ends = list(crew.sharing(self).each(partial(_end, gain), list(glances[:2])))
         return min(ends, key=lambda one: self.cost(one[0])) if len(ends) > 1 else ends[0]
 
     def best(self, starts: Sequence[Vector], crew: Crew = ALONE) -> Optimum:
-        """The optimum of `lowest`, described."""
-        x, converged = self.lowest(starts, crew=crew)
+        """The optimum reached from the best of several starts, described; errors as of `glanced`."""
+        x, converged = self.followed(self.glanced(starts, crew=crew), crew=crew)
         return self.at(x, converged=converged)
 
 
-def _glance(
-    most: int, gain: float, regression: Regression, start: Vector
-) -> tuple[float, Vector, bool] | None:
-    """Cost [nat] and coordinates after so many evaluations, and whether an optimum is reached; None where the
-    response at the start is not finite."""
+@final
+class Glance(NamedTuple):
+    """Where a few evaluations from a start end."""
+
+    cost: float
+    """[nat]."""
+    x: Vector
+    converged: bool
+    """Whether that is an optimum."""
+
+
+def _glance(gain: float, regression: Regression, start: Vector) -> Glance | None:
+    """A glance from a start; None where the response there is not finite."""
     try:
-        x, converged = regression.reached(start, most=most, gain=gain)
+        x, converged = regression.reached(start, most=_GLANCE, gain=gain)
     except ArithmeticError:
         return None
-    return regression.cost(x), x, converged
+    return Glance(regression.cost(x), x, converged)
 
 
-def _end(gain: float, regression: Regression, start: Vector) -> tuple[Vector, bool]:
-    return regression.reached(start, gain=gain)
+def _end(gain: float, regression: Regression, glance: Glance) -> tuple[Vector, bool]:
+    return (glance.x, True) if glance.converged else regression.reached(glance.x, gain=gain)
 
 
 def _solved(matrix: Matrix, right: Vector, free: Flags) -> Vector:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, Self, final
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.acceptance import accepted, beside_dynamics, large, leader
 from lcopa_bayes.effectsearch.basefit import settled
-from lcopa_bayes.effectsearch.candidates import refitted
+from lcopa_bayes.effectsearch.candidates import followed, refitted, rough
 from lcopa_bayes.effectsearch.effectpairs import both, paired
 from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
@@ -65,6 +65,10 @@ class Round:
             return self
         refits, failures = refitted(self.state, self.trace, crew, rival)
         return replace(self, refits=tuple(refits), failures=tuple(failures))
+
+    def followed(self, crew: Crew) -> Self:
+        """With all of its refits at their optima."""
+        return replace(self, refits=tuple(followed(self.state, self.refits, crew)))
 
     @property
     def leading(self) -> Refit | None:
@@ -224,20 +228,28 @@ def _one_by_one(
     generic: bool = True,
 ) -> list[Round]:
     """Rounds `before` and those that each add an effect but the last; only effects ahead of any `generic`
-    class, unless that is no rival."""
+    class, unless that is no rival.
+
+    Where two effects leave far more than the noise no third is looked for: one of a device that no two of the
+    catalogue describe was searched for most of an hour, for a name that the verdict refused.
+    """
     look, rounds = first, list(before)
     while True:
         seen, state, number = look.trace, look.state, len(rounds)
-        if not (seen.alarmed or state.whitening.dependence) or number == MOST:
+        beyond = len(state.model.effects) > 1 and rough(seen)
+        if not (seen.alarmed or state.whitening.dependence) or number == MOST or beyond:
             return [*rounds, Round(state, seen)]
         beside = f" beside {', '.join(one.name for one in state.model.effects)}" if number else ""
         crew.stage(f"refitting with each effect that comes into question{beside}")
         look = look.refitted(crew)
         # what one refit leaves is not noise alone: a further effect must stand out from it
-        bar = seen.threshold + (MARGIN if number else 0.0)
-        allowed = accepted(look.refits, seen, bar, generic=generic)
-        likely = [one for one in allowed if not alone or large(one)]
-        chosen = leader(beside_dynamics(likely, [one for one in look.refits if one.dynamics]))
+        choice = partial(
+            _choice, bar=seen.threshold + (MARGIN if number else 0.0), alone=alone, generic=generic
+        )
+        chosen = choice(look)
+        if chosen is not None and chosen.glances:  # none of those that were far ahead is accepted
+            look = look.followed(crew)
+            chosen = choice(look)
         named = any(not effect.card.dynamics for effect in state.model.effects)
         if chosen is not None and chosen.dynamics and (named or before):
             chosen = None  # beside a named effect they are what remains, which the verdict weighs
@@ -245,6 +257,13 @@ def _one_by_one(
         if chosen is None:
             return rounds
         look = looking(in_proportion(_kept(chosen)))
+
+
+def _choice(look: Round, *, bar: float, alone: bool, generic: bool) -> Refit | None:
+    """The refit of a round to add, of more evidence than a `bar` [nat]; None where none is accepted."""
+    allowed = accepted(look.refits, look.trace, bar, generic=generic)
+    likely = [one for one in allowed if not alone or large(one)]
+    return leader(beside_dynamics(likely, [one for one in look.refits if one.dynamics]))
 
 
 def _past_generic(rounds: list[Round], looking: Callable[[State], Round], crew: Crew) -> list[Round]:

@@ -489,7 +489,7 @@ def test_what_remains_must_hold_against_the_refit(bent):
     given = {"outliers": None, "cautions": (), "alone": False}
 
     def found(*refits):
-        searched = Search.ending((*before, replace(last, trace=seen, refits=refits)), {})
+        searched = Search.ending((*before, replace(last, trace=seen, refits=refits)), dict)
         return findings.findings_of(bent.problem.study, searched, *sides, **given)
 
     alarm, none = found(), found(*every)
