@@ -14,7 +14,7 @@ Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -27,7 +27,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.effects.effect import Coefficient, Effect, Ranges
-from lcopa_bayes.model.effects.jacobian import coefficient_slopes, plant_slopes
+from lcopa_bayes.model.effects.jacobian import Number, coefficient_slopes, plant_slopes, slopes
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.effects.scales import ranges_of
 from lcopa_bayes.model.effects.simulator import Latest, Simulator
@@ -136,9 +136,17 @@ class Effected:
 
         Exact without effects; see `model.effects.jacobian.plant_slopes` for what is differenced.
         """
-        at, table = self.vanishing if psi is None else psi, self.table
-        slopes = plant_slopes(self.simulator, self.plant(values), at)
-        out = []
+        at = self.vanishing if psi is None else psi
+        return self._by_row(plant_slopes(self.simulator, self.plant(values), at))
+
+    def slopes(self, values: Vector, psi: Vector) -> tuple[list[Matrix], list[Matrix]]:
+        """`jacobian` and `signature`, by fewer simulations than one after the other."""
+        by_number, by_coefficient = slopes(self.simulator, self.plant(values), psi)
+        return self._by_row(by_number), by_coefficient
+
+    def _by_row(self, slopes: Sequence[Mapping[Number, Matrix]]) -> list[Matrix]:
+        """Slopes in the numbers of the plant as those in the table's values."""
+        table, out = self.table, []
         for r, slope in enumerate(slopes):
             jacobian = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
@@ -190,11 +198,14 @@ def effect_slopes(
     good enough to descend with. Raises UnstableError where there is no bounded response.
     """
     model, psi = model or effected_at(simulation, values), simulation.psi(values)
-    plant = model if exact else model.with_effects(())
-    out = plant.jacobian(values, psi if exact else plant.vanishing)
+    if exact:
+        out, by_coefficient = model.slopes(values, psi)
+    else:
+        plant = model.with_effects(())
+        out, by_coefficient = plant.jacobian(values, plant.vanishing), model.signature(values, psi)
     rows = [k for each in simulation.coefficients for k in each]
     if rows:
-        for whole, slope in zip(out, model.signature(values, psi), strict=True):
+        for whole, slope in zip(out, by_coefficient, strict=True):
             whole[..., rows] = slope
     for e, constants in enumerate(simulation.constants):
         for position, k in enumerate(constants):

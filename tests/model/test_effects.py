@@ -216,6 +216,33 @@ def test_jacobian_with_an_effect(name: str):
         assert apart([j[..., k] for j in exact], slope) < 2e-3 * size, row.name
 
 
+@pytest.mark.parametrize(
+    ("names", "calls"),
+    [
+        (("cubic_stiffness",), 1),
+        (("rise_fall_asymmetry", "overflow", "ion_creep"), 1),
+        (("viscosity_drift", "sensor_lag", "odd_curvature"), 1),
+        (("clock_skew", "cubic_stiffness", "pointing_offset"), 1),
+        (("odd_curvature", "overdrive_pulse"), 0),
+    ],
+)
+def test_all_slopes_at_once_are_those_one_after_the_other(names, calls, monkeypatch):
+    """By one set of simulations where something acts before the reading."""
+    made = BASE.with_effects(
+        [ALL[name].grid(BASE.ranges)[len(ALL[name].grid(BASE.ranges)) // 2] for name in names]
+    )
+    psi, inner, asked = 0.3 * scales(made), simulator.Simulator.moved_together, []
+    by_row, by_coefficient = made.jacobian(VALUES, psi), made.signature(VALUES, psi)
+    monkeypatch.setattr(
+        simulator.Simulator, "moved_together", lambda own, cases: asked.append(cases) or inner(own, cases)
+    )
+    at_once = made.slopes(VALUES, psi)
+    assert sum(len(cases) > len(VALUES) // 2 for cases in asked) == calls
+    assert len(asked) == 1
+    assert apart(at_once[0], by_row) < 1e-6 * max(float(np.abs(one).max()) for one in by_row)
+    assert apart(at_once[1], by_coefficient) < 1e-6 * max(float(np.abs(one).max()) for one in by_coefficient)
+
+
 def test_jacobian_without_effects_is_exact():
     plain = BASE.jacobian(VALUES)
     for k in range(len(BASE.table.rows)):
@@ -318,10 +345,12 @@ def test_slopes_exist_wherever_the_response_is_bounded():
     back[gain] -= step
     by_hand = (here - made.responses(back, psi)[0]) / step
     assert_allclose(made.jacobian(values, psi)[0][..., gain], by_hand, rtol=1e-6, atol=1e-9)
-    with pytest.raises(UnstableError):
-        made.jacobian(values, psi - 0.1)
-    with pytest.raises(UnstableError):
-        made.signature(values, psi - 0.1)
+    by_row, by_coefficient = made.slopes(values, psi)
+    assert_allclose(by_row[0], made.jacobian(values, psi)[0], rtol=1e-12)
+    assert_allclose(by_coefficient[0], made.signature(values, psi)[0], rtol=1e-12)
+    for slopes in (made.jacobian, made.signature, made.slopes):
+        with pytest.raises(UnstableError):
+            slopes(values, psi - 0.1)
 
 
 def test_sensor_lag_is_one_more_lag():

@@ -19,8 +19,13 @@ from lcopa_bayes.model.effects.passage import Moved, Plant
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import Dynamics
 
+Number: TypeAlias = tuple[str, int, int]
+"""A number of the plant: "gain" by response and drive, "time" or "order" by element and term, "delay" by slot
+and 0."""
 COEFFICIENT_STEP = 1e-3
 """Step of a coefficient, in prior standard deviations [-]."""
+_RELATIVE = 1e-5
+"""Step of a plant's number in units of its scale [-]; with a solver good to 1e-12 both errors are 1e-7."""
 
 
 @final
@@ -65,14 +70,48 @@ def coefficient_slopes(
     records at once: records do not see each other's. What a parallel effect adds to a reading that no other
     effect bends is the slope itself. Raises UnstableError where the response there is not bounded.
     """
-    effects, records, first = simulator.effects, len(simulator.model.experiments), 0
-    bent = any(isinstance(effect, ReadoutEffect) for effect in effects)
-    adding = {
+    differences = _differences(simulator, psi, last=last)
+    try:
+        read = simulator.moved_together(_cases(plant, psi, differences))
+    except UnstableError:
+        differences = [one.to_one_side(simulator, plant, psi) for one in differences]
+        read = simulator.moved_together(_cases(plant, psi, differences))
+    return _by_coefficient(simulator, psi, differences, read)
+
+
+def slopes(
+    simulator: Simulator, plant: Plant, psi: Vector
+) -> tuple[list[dict[Number, Matrix]], list[Matrix]]:
+    """`plant_slopes` and `coefficient_slopes`, at once where something acts before the reading: what forces
+    take is mostly time per block, whatever the number of plants."""
+    if simulator.bends(psi):
+        numbers, differences = list(_numbers(simulator, plant)), _differences(simulator, psi)
+        with suppress(UnstableError):  # else each on its own, to the side where there is a response
+            cases = [*_with_each(plant, psi, numbers), *_cases(plant, psi, differences)[1:]]
+            moved = simulator.moved_together(cases)
+            by_number, steps = moved[: len(numbers) + 1], moved[len(numbers) + 1 :]
+            return (
+                _by_number(simulator, psi, numbers, by_number),
+                _by_coefficient(simulator, psi, differences, [moved[0], *steps]),
+            )
+    return plant_slopes(simulator, plant, psi), coefficient_slopes(simulator, plant, psi)
+
+
+def _adding(simulator: Simulator) -> dict[int, ParallelEffect]:
+    """Effects, by position, whose slope is what they add to a reading that no other effect bends."""
+    if any(isinstance(effect, ReadoutEffect) for effect in simulator.effects):
+        return {}
+    return {
         e: effect
-        for e, effect in enumerate(effects)
-        if isinstance(effect, ParallelEffect) and effect.linear and not bent
+        for e, effect in enumerate(simulator.effects)
+        if isinstance(effect, ParallelEffect) and effect.linear
     }
-    differences = list[_Difference]()
+
+
+def _differences(simulator: Simulator, psi: Vector, *, last: bool = False) -> list[_Difference]:
+    """A difference in every coefficient, or in those of the last effect, that needs one."""
+    effects, records, first = simulator.effects, len(simulator.model.experiments), 0
+    adding, differences = _adding(simulator), list[_Difference]()
     for e, effect in enumerate(effects):
         coefficients = effect.coefficients(simulator.ranges)
         repeats = records if effect.card.per_record else 1
@@ -87,11 +126,22 @@ def coefficient_slopes(
                 steps, weights = np.array([step, -step]), np.array([0.0, 0.5, -0.5])
             differences.append(_Difference(columns, effect.card.per_record, steps, weights / step))
         first += len(coefficients) * repeats
-    try:
-        here, read = _read(simulator, plant, psi, differences)
-    except UnstableError:
-        differences = [one.to_one_side(simulator, plant, psi) for one in differences]
-        here, read = _read(simulator, plant, psi, differences)
+    return differences
+
+
+def _cases(plant: Plant, psi: Vector, differences: Sequence[_Difference]) -> list[tuple[Plant, Vector]]:
+    """A plant with its coefficients, and with each step of all differences."""
+    return [(plant, psi), *((plant, each) for one in differences for each in one.cases(psi))]
+
+
+def _by_coefficient(
+    simulator: Simulator, psi: Vector, differences: Sequence[_Difference], moved: Sequence[Sequence[Moved]]
+) -> list[Matrix]:
+    """Slopes per record, from the records of `_cases` up to their reading."""
+    here = moved[0]
+    cases = [psi, *(each for one in differences for each in one.cases(psi))]
+    pairs = zip(moved, cases, strict=True) if differences else ()
+    read = [simulator.finished(own, each) for own, each in pairs]
     out = [np.zeros((*deflection.shape, simulator.size)) for _, deflection in here]
     base, place = read[:1], 1
     for one in differences:
@@ -100,30 +150,12 @@ def coefficient_slopes(
             slope = sum(w * y for w, y in zip(one.weights, responses, strict=True))
             out[r][..., one.columns[r if one.per_record else 0]] = slope
     places = np.arange(simulator.size, dtype=float)
-    for e, adds in adding.items():
+    for e, adds in _adding(simulator).items():
         for r, (scene, _) in enumerate(here):
             own = simulator.part(places, e, r).astype(int)
             for k, unit in zip(own, np.eye(own.size), strict=True):
                 out[r][..., k] = adds.added(scene, unit)
     return out
-
-
-def _read(
-    simulator: Simulator, plant: Plant, psi: Vector, differences: Sequence[_Difference]
-) -> tuple[list[Moved], list[list[Matrix]]]:
-    """Every record up to its reading, and the readings there and with each step of all differences; none
-    where nothing is differenced."""
-    cases = [psi, *(case for one in differences for case in one.cases(psi))]
-    moved = simulator.moved_together([(plant, each) for each in cases])
-    pairs = zip(moved, cases, strict=True) if differences else ()
-    return moved[0], [simulator.finished(own, each) for own, each in pairs]
-
-
-Number: TypeAlias = tuple[str, int, int]
-"""A number of the plant: "gain" by response and drive, "time" or "order" by element and term, "delay" by slot
-and 0."""
-_RELATIVE = 1e-5
-"""Step of a plant's number in units of its scale [-]; with a solver good to 1e-12 both errors are 1e-7."""
 
 
 def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[Number, Matrix]]:
@@ -138,15 +170,15 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
     numbers = list(_numbers(simulator, plant))
     if simulator.bends(psi):
         try:
-            base, *moved = _with_each(simulator, plant, psi, numbers)
+            moved = simulator.moved_together(_with_each(plant, psi, numbers))
         except UnstableError:
             numbers = [_bounded(simulator, plant, psi, *one) for one in numbers]
-            base, *moved = _with_each(simulator, plant, psi, numbers)
+            moved = simulator.moved_together(_with_each(plant, psi, numbers))
     else:
         others = [_shifted(plant, number, step) for number, step in numbers]
         base, exact = simulator.moved(plant, psi), _linear_slopes(simulator, plant, psi)
         delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
-        moved = [
+        each = (
             simulator.moved(other, psi)
             if number[0] == "delay" and delayed
             else [
@@ -154,21 +186,32 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
                 for scene, y, slope in zip(simulator.scenes(other, psi), base, exact, strict=True)
             ]
             for (number, step), other in zip(numbers, others, strict=True)
-        ]
-    here = simulator.finished(base, psi)
+        )
+        moved = [base, *each]
+    return _by_number(simulator, psi, numbers, moved)
+
+
+def _by_number(
+    simulator: Simulator,
+    psi: Vector,
+    numbers: Sequence[tuple[Number, float]],
+    moved: Sequence[Sequence[Moved]],
+) -> list[dict[Number, Matrix]]:
+    """Slopes per record, from the records of a plant, and with each number changed, up to their reading."""
+    here = simulator.finished(moved[0], psi)
     out: list[dict[Number, Matrix]] = [{} for _ in here]
-    for (number, step), each in zip(numbers, moved, strict=True):
+    for (number, step), each in zip(numbers, moved[1:], strict=True):
         for r, there in enumerate(simulator.finished(each, psi)):
             out[r][number] = (there - here[r]) / step
     return out
 
 
 def _with_each(
-    simulator: Simulator, plant: Plant, psi: Vector, numbers: Sequence[tuple[Number, float]]
-) -> list[list[Moved]]:
-    """Every record of a plant, and with each of some numbers changed."""
+    plant: Plant, psi: Vector, numbers: Sequence[tuple[Number, float]]
+) -> list[tuple[Plant, Vector]]:
+    """A plant, and with each of some numbers changed, with its coefficients."""
     others = [_shifted(plant, number, step) for number, step in numbers]
-    return simulator.moved_together([(each, psi) for each in (plant, *others)])
+    return [(each, psi) for each in (plant, *others)]
 
 
 def _bounded(
