@@ -221,6 +221,7 @@ def _round(one: Round) -> dict[str, Any]:
                 **attributes(candidate, "added", "log_bayes_factor", "significant"),
                 "left_out_gain": candidate.left_out,
                 "converged": candidate.optimum.converged,
+                "ended": not candidate.glances,
             }
             for candidate in one.refits
         ],
