@@ -197,17 +197,17 @@ def effect_slopes(
     over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and
     good enough to descend with. Raises UnstableError where there is no bounded response.
     """
-    model, psi = model or effected_at(simulation, values), simulation.psi(values)
+    model, psi = model or effected_at(simulation, values), simulation.rows.psi(values)
     if exact:
         out, by_coefficient = model.slopes(values, psi)
     else:
         plant = model.with_effects(())
         out, by_coefficient = plant.jacobian(values, plant.vanishing), model.signature(values, psi)
-    rows = [k for each in simulation.coefficients for k in each]
+    rows = [k for each in simulation.rows.coefficients for k in each]
     if rows:
         for whole, slope in zip(out, by_coefficient, strict=True):
             whole[..., rows] = slope
-    for e, constants in enumerate(simulation.constants):
+    for e, constants in enumerate(simulation.rows.constants):
         for position, k in enumerate(constants):
             if simulation.table.rows[k].free:
                 for whole, slope in zip(out, _by_constant(model, values, psi, (e, position, k)), strict=True):
@@ -220,7 +220,7 @@ def effected_at(simulation: Simulation, values: Vector) -> Effected:
     declared = simulation.declared
     names = tuple(one.name for one in simulation.model.experiments)
     offsets = tuple(-2 if place is None else place for place in declared.fitted)
-    return Effected(simulation.table, simulation.simulator(simulation.effects(values)), names, offsets)
+    return Effected(simulation.table, simulation.simulator(simulation.rows.effects(values)), names, offsets)
 
 
 def _by_constant(model: Effected, values: Vector, psi: Vector, at: tuple[int, int, int]) -> list[Matrix]:

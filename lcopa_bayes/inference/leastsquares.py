@@ -136,7 +136,7 @@ class LeastSquares:
         posterior = self.posterior
         if posterior.simulation is not None and posterior.surrogate is None:
             model = self._effected_at(values[0])
-            responses = model.responses(values[0], posterior.simulation.psi(values[0]))
+            responses = model.responses(values[0], posterior.simulation.rows.psi(values[0]))
             for response, samples in zip(responses, posterior.samples, strict=True):
                 for axis, observed in enumerate(samples.axes):
                     yield axis, observed, response[observed.index, axis] - observed.values
@@ -154,7 +154,7 @@ class LeastSquares:
 
     def _effected_at(self, values: Vector) -> Effected:
         assert self.posterior.simulation is not None
-        key = self.posterior.simulation.effects(values)
+        key = self.posterior.simulation.rows.effects(values)
         if key not in self._latest:
             self._latest.clear()
             self._latest[key] = effected_at(self.posterior.simulation, values)

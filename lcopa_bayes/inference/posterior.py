@@ -286,12 +286,12 @@ class Posterior:
         """Gains and offsets of each response axis; with effects what they leave linear."""
         acting = self.table.of_kind("gain") + self.table.of_kind("offset")
         if self.simulation is not None:
-            acting = [*sorted(self.simulation.scaled), *self.table.of_kind("offset")]
+            acting = [*sorted(self.simulation.rows.scaled), *self.table.of_kind("offset")]
         axes = range(len(self.table.layout.responses))
         return [[k for k in acting if self.table.rows[k].response == axis] for axis in axes]
 
     def _is_linear(self, k: int, row: Parameter) -> bool:
-        scaled = row.kind == "gain" if self.simulation is None else k in self.simulation.scaled
+        scaled = row.kind == "gain" if self.simulation is None else k in self.simulation.rows.scaled
         return (scaled or row.kind == "offset") and row.prior is not None and row.prior.dist == "norm"
 
     @cached_property

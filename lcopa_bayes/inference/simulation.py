@@ -16,11 +16,10 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.effectrows import EffectRows
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import (
-    Constant,
     DriveEffect,
     Effect,
     ForceEffect,
@@ -31,7 +30,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 from lcopa_bayes.model.effects.passage import Moved, Plant, forced
 from lcopa_bayes.model.effects.simulator import UPSTREAM, Simulator
-from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
+from lcopa_bayes.model.forward import ForwardModel, deflections
 
 _ACCURACY = 1e-9
 """Accuracy of responses under forces over their scale [-]: slopes are not taken from them (`effects`), and
@@ -67,102 +66,33 @@ class Simulation:
         return self.model.effects
 
     @cached_property
-    def scaled(self) -> frozenset[int]:
-        """Rows that have a column: gains where responses are linear in them, coefficients that only add."""
-        rows = self.table.rows
-        gains = self.table.of_kind("gain") if self.declared.affine else []
-        return frozenset([*gains, *(k for k, row in enumerate(rows) if row.adds_to is not None)])
-
-    @cached_property
-    def coefficients(self) -> list[list[int]]:
-        """Table rows of the coefficients of each effect, those of one record after those of another."""
-        return self._rows(COEFFICIENTS)
-
-    @cached_property
-    def constants(self) -> list[list[int]]:
-        """Table rows of the internal constants of each effect."""
-        return self._rows(CONSTANTS)
-
-    def _rows(self, kinds: tuple[str, ...]) -> list[list[int]]:
-        rows = self.table.rows
-        out = []
-        for e in range(len(self.declared.kinds)):
-            mine = [k for k, row in enumerate(rows) if row.kind in kinds and row.place.first == e]
-            out.append(sorted(mine, key=lambda k: rows[k].place.second))
-        return out
-
-    def effects(self, values: Vector) -> tuple[Effect, ...]:
-        """The effects with the internal constants of table values, (rows,)."""
-        return tuple(
-            kind.with_constants(own, values[rows].tolist())
-            for kind, own, rows in zip(self.declared.kinds, self._internal, self.constants, strict=True)
-        )
-
-    @cached_property
-    def _internal(self) -> list[tuple[Constant, ...]]:
-        """Internal constants of each effect, whose ends are those of a grid of instances."""
-        return [kind.internal(self.declared.ranges) for kind in self.declared.kinds]
-
-    def psi(self, values: Vector) -> Vector:
-        """Coefficients as a simulator of this model's records takes them; those of another record are 0."""
-        parts = []
-        for e, (kind, rows) in enumerate(zip(self.declared.kinds, self.coefficients, strict=True)):
-            if not kind.card.per_record:
-                parts.append(values[rows])
-                continue
-            count = self._counts[e]
-            for place in self.declared.fitted:
-                own = [] if place is None else rows[place * count : (place + 1) * count]
-                parts.append(values[own] if own else np.zeros(count))
-        return np.concatenate(parts) if parts else np.empty(0)
-
-    @cached_property
-    def _counts(self) -> list[int]:
-        """Coefficients of each effect, or of one record of it [-]."""
-        ranges = self.declared.ranges
-        instances = (
-            kind.with_constants(own, [one.low for one in own])
-            for kind, own in zip(self.declared.kinds, self._internal, strict=True)
-        )
-        return [len(instance.coefficients(ranges)) for instance in instances]
+    def rows(self) -> EffectRows:
+        """What the rows of the table are for them."""
+        return EffectRows(self.table, self.declared)
 
     def simulator(self, effects: tuple[Effect, ...]) -> Simulator:
         """What simulates one plant with these effects."""
         declared = self.declared
         return Simulator(self.model.plain, effects, declared.ranges, declared.epochs, declared.times)
 
-    def dynamics(self, values: Matrix) -> Dynamics:
-        """What shapes the responses at canonical table values, (batch, rows), lags of the drive included."""
-        dynamics = self.table.dynamics(values)
-        for effect, rows in zip(self.effects(values[0]), self.coefficients, strict=True):
-            if isinstance(effect, DriveEffect) and effect.lags:
-                dynamics = dynamics.later(effect.lag(self.declared.ranges, values[:, rows].T))
-        return dynamics
-
-    def plant(self, values: Vector) -> Plant:
-        """The plant of canonical table values, (rows,), without offsets."""
-        batch = values[None]
-        offsets = np.zeros((len(self.model.experiments), len(self.table.layout.responses)))
-        return Plant(self.table.gains(batch)[0], self.table.dynamics(batch), offsets)
-
     def __call__(self, values: Matrix) -> list[Simulated]:
         """Every record at canonical table values, (batch, rows)."""
         declared, batch, layout = self.declared, len(values), self.table.layout
         shared = None
         if not (declared.bending or declared.commanding):
-            shared = self.model.plain.unit_responses(self.dynamics(values))
+            shared = self.model.plain.unit_responses(self.rows.dynamics(values))
         bounded = np.ones(batch, dtype=bool)
         out = [
             Simulated(
                 np.zeros((len(layout.responses), batch, times.size)),
-                {k: np.zeros((batch, times.size)) for k in self.scaled if self._acts(k, r)},
+                {k: np.zeros((batch, times.size)) for k in self.rows.scaled if self._acts(k, r)},
                 bounded,
             )
             for r, times in enumerate(declared.times)
         ]
         pending = np.arange(0 if declared.forced else batch)
         if declared.forced:
-            self._forced(values, out, bounded)
+            self._forced(values, out)
         elif self._scales_commands(values):
             pending = self._commanded(values, out)
         for some in np.array_split(pending, max(1, -(-pending.size // _ABREAST))):
@@ -190,7 +120,7 @@ class Simulation:
         They are drawn as large as those of the fit records: normal about 0, of their root mean square.
         """
         declared, out = self.declared, values.copy()
-        for kind, rows, count in zip(declared.kinds, self.coefficients, self._counts, strict=True):
+        for kind, rows, count in zip(declared.kinds, self.rows.coefficients, self.rows.counts, strict=True):
             if kind.card.per_record:
                 fitted = values[:, rows].reshape(len(values), -1, count)
                 size = np.sqrt(np.mean(fitted**2, axis=1))
@@ -204,7 +134,7 @@ class Simulation:
         if row.kind == "gain":
             experiment, drive = self.model.experiments[r], row.place.second
             return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
-        return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
+        return self.declared.fitted[r] == row.place.second // self.rows.counts[row.place.first]
 
     def _each(
         self, values: Matrix, some: Sequence[int], shared: list[Array] | None, out: list[Simulated]
@@ -212,7 +142,7 @@ class Simulation:
         """Write the responses of some plants, each with effects of its own."""
         simulators: dict[tuple[Effect, ...], Simulator] = {}
         alike: dict[tuple[Effect, ...], list[int]] = {}
-        effects = {b: self.effects(values[b]) for b in some}
+        effects = {b: self.rows.effects(values[b]) for b in some}
         for b, every in effects.items():
             simulators[every] = self.simulator(every)
             alike.setdefault(tuple(one for one in every if isinstance(one, UPSTREAM)), []).append(b)
@@ -233,14 +163,13 @@ class Simulation:
         apart = any(isinstance(effect, (DriveEffect, ForceEffect)) for effect in simulator.effects)
         if apart or not self.declared.bending:
             return []
-        parts = [self._parts(self.plant(row)) for row in values]
-        psis = [self.psi(self._without_scaled(row)) for row in values]
-        cases = [(part, psi) for own, psi in zip(parts, psis, strict=True) for part in own]
+        pairs = [self.rows.unscaled(row) for row in values]
+        cases = [(part, psi) for plant, psi in pairs for part in self._parts(plant)]
         try:
             moved = simulator.moved_together(cases)
         except UnstableError:
             return []
-        size = len(parts[0])
+        size = len(cases) // len(values)
         return [moved[first : first + size] for first in range(0, len(moved), size)]
 
     def _parts(self, plant: Plant) -> list[Plant]:
@@ -251,20 +180,22 @@ class Simulation:
         responses, drives = plant.gains.shape
         return [replace(plant, gains=np.tile(unit, (responses, 1))) for unit in np.eye(drives)]
 
-    def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
+    def _forced(self, values: Matrix, out: list[Simulated]) -> None:
         """Write the responses of plants under forces, all at once."""
-        declared, axes = self.declared, len(self.table.layout.responses)
+        declared, axes, bounded = self.declared, len(self.table.layout.responses), out[0].bounded
         gains, commanded = self.table.gains(values), values if declared.commanding else values[:0]
-        dynamics = self.table.dynamics(values) if declared.commanding else self.dynamics(values)
-        pairs = ((self.simulator(self.effects(row)), row) for row in commanded)
-        each = [one.commanded(self.plant(row), self.psi(row)) for one, row in pairs]
+        dynamics = self.table.dynamics(values) if declared.commanding else self.rows.dynamics(values)
+        pairs = ((self.simulator(self.rows.effects(row)), row) for row in commanded)
+        each = [one.commanded(self.rows.plant(row), self.rows.psi(row)) for one, row in pairs]
         forces = []
-        for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
+        for kind, rows, constants in zip(
+            declared.kinds, self.rows.coefficients, self.rows.constants, strict=True
+        ):
             if issubclass(kind, ForceEffect):
                 psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
                 own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
                 forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
-        simulator, plant = self.simulator(self.effects(values[0])), self.plant(values[0])
+        simulator, plant = self.simulator(self.rows.effects(values[0])), self.rows.plant(values[0])
         scenes = [simulator.scene(r, plant) for r in range(len(out))]
         records = forced(self.model.plain, scenes, gains, dynamics, forces, _ACCURACY, each)
         for record, (deflection, failures) in zip(out, records, strict=True):
@@ -272,7 +203,7 @@ class Simulation:
             record.base[...] = deflection
         if not all(issubclass(kind, (DriveEffect, ForceEffect)) for kind in declared.kinds):
             for b in np.flatnonzero(bounded).tolist():
-                simulator = self.simulator(self.effects(values[b]))
+                simulator = self.simulator(self.rows.effects(values[b]))
                 self._finished(simulator, values[b], b, out)
 
     def _scales_commands(self, values: Matrix) -> bool:
@@ -284,19 +215,19 @@ class Simulation:
         e = self.declared.kinds.index(drive[0])
         others = [k for k in self.declared.kinds if k is not drive[0]]
         read = all(issubclass(k, ReadoutEffect) and not k.affine for k in others)
-        same = not np.ptp(values[:, self.constants[e]], axis=0).any()
-        return read and same and len(self.coefficients[e]) == 1
+        same = not np.ptp(values[:, self.rows.constants[e]], axis=0).any()
+        return read and same and len(self.rows.coefficients[e]) == 1
 
     def _commanded(self, values: Matrix, out: list[Simulated]) -> Index:
         """Write the responses of plants under commands that change in proportion to one coefficient."""
         layout, gains = self.table.layout, self.table.gains(values)
         dynamics = self.table.dynamics(values)
         e = next(k for k, kind in enumerate(self.declared.kinds) if issubclass(kind, DriveEffect))
-        unit, at = values[0].copy(), self.coefficients[e][0]
-        unit[[k for rows in self.coefficients for k in rows]] = 0.0
+        unit, at = values[0].copy(), self.rows.coefficients[e][0]
+        unit[[k for rows in self.rows.coefficients for k in rows]] = 0.0
         unit[at] = 1.0
-        simulator = self.simulator(self.effects(values[0]))
-        there = simulator.driven(simulator.scenes(self.plant(unit), self.psi(unit)))
+        simulator = self.simulator(self.rows.effects(values[0]))
+        there = simulator.driven(simulator.scenes(self.rows.plant(unit), self.rows.psi(unit)))
         plain, size = self.model.plain, values[:, at, None]
         if not _as_exact(plain, there):
             return np.arange(len(values))
@@ -314,29 +245,23 @@ class Simulation:
                         out[r].columns[k][...] = column
         if len(self.declared.kinds) > 1:
             for b, row in enumerate(values):
-                self._finished(self.simulator(self.effects(row)), row, b, out)
+                self._finished(self.simulator(self.rows.effects(row)), row, b, out)
         return np.arange(0)
 
     def _finished(self, simulator: Simulator, row: Vector, b: int, out: list[Simulated]) -> None:
         """What comes after the reading, on responses of one plant that are there already."""
-        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        plant, psi = self.rows.unscaled(row)
         scenes = simulator.scenes(plant, psi)
         moved = [Moved(scene, record.base[:, b].T) for scene, record in zip(scenes, out, strict=True)]
         for record, y in zip(out, simulator.finished(moved, psi), strict=True):
             record.base[:, b] = y.T
         self._added(simulator, plant, b, out)
 
-    def _without_scaled(self, row: Vector) -> Vector:
-        """Table values with the coefficients that have a column at 0."""
-        still = row.copy()
-        still[[k for k in self.scaled if self.table.rows[k].kind != "gain"]] = 0.0
-        return still
-
     def _one(
         self, simulator: Simulator, row: Vector, moved: list[list[Moved]], b: int, out: list[Simulated]
     ) -> None:
         """Write one plant's responses from those of its parts up to their reading."""
-        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        plant, psi = self.rows.unscaled(row)
         if not self.declared.affine:
             for record, y in zip(out, simulator.finished(moved[0], psi), strict=True):
                 record.base[:, b] = y.T
@@ -357,7 +282,7 @@ class Simulation:
     def _unread(self, simulator: Simulator, row: Vector, units: list[Array] | None) -> list[list[Moved]]:
         """Of one plant, the records of every part of its response up to its reading, by its unit responses
         where they are known."""
-        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        plant, psi = self.rows.unscaled(row)
         if self.declared.bending:
             return [simulator.moved(part, psi) for part in self._parts(plant)]
         scenes = simulator.scenes(plant, psi)
@@ -375,11 +300,12 @@ class Simulation:
 
     def _added(self, simulator: Simulator, plant: Plant, b: int, out: list[Simulated]) -> None:
         """Columns of the coefficients that only add."""
-        for e, rows in enumerate(self.coefficients):
-            effect = simulator.effects[e]
-            if not (isinstance(effect, ParallelEffect) and effect.additive) or rows[0] not in self.scaled:
+        for e, rows in enumerate(self.rows.coefficients):
+            effect, count = simulator.effects[e], self.rows.counts[e]
+            if not (isinstance(effect, ParallelEffect) and effect.additive):
                 continue
-            count = self._counts[e]
+            if rows[0] not in self.rows.scaled:
+                continue
             for r, place in enumerate(self.declared.fitted):
                 if place is None:
                     continue

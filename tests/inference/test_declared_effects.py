@@ -87,8 +87,8 @@ def test_responses_are_those_of_the_simulator(name: str):
     simulation = posterior.simulation
     assert simulation is not None
     names = tuple(one.name for one in TWO_AXES.fit)
-    whole = Effected(posterior.table, simulation.simulator(simulation.effects(values)), names, (0, 1))
-    direct = whole.responses(values, simulation.psi(values))
+    whole = Effected(posterior.table, simulation.simulator(simulation.rows.effects(values)), names, (0, 1))
+    direct = whole.responses(values, simulation.rows.psi(values))
     for r, (split, y) in enumerate(zip(simulation.responses(values[None]), direct, strict=True)):
         for axis in range(y.shape[1]):
             level = posterior.table.offset(values[None], axis, r)[0]
@@ -396,10 +396,10 @@ def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):
     batch = simulation.responses(values)
     for k, row in enumerate(values):
         one = Effected(
-            made.posterior.table, simulation.simulator(simulation.effects(row)), ("r1", "r2"), (0, 1)
+            made.posterior.table, simulation.simulator(simulation.rows.effects(row)), ("r1", "r2"), (0, 1)
         )
-        plant = simulation.plant(row)
-        alone = one.simulator.responses(plant, simulation.psi(row))
+        plant = simulation.rows.plant(row)
+        alone = one.simulator.responses(plant, simulation.rows.psi(row))
         for together, y in zip(batch, alone, strict=True):
             assert_allclose(together[:, k], y.T, rtol=0, atol=1e-9)
 
