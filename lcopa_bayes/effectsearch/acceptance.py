@@ -1,4 +1,4 @@
-"""Which refits of a round may be kept, and which of them leads."""
+"""Which refits of a round may be kept, which of them leads, and with what that is confounded."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.refits import Refit, refit
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.signature import Projection, expected_margin, signature_of
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import MARGIN
 
@@ -92,6 +94,36 @@ def leader(accepted: Sequence[Refit]) -> Refit | None:
     level = [one for one in accepted if one.log_bayes_factor > first.log_bayes_factor - MARGIN]
     shared = (one for one in level if not any(c.record is not None for c in one.new))
     return next((one for one in shared if one.left_out > first.left_out - MARGIN), first)
+
+
+def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:
+    """Names that these records confound with the chosen one, its own first.
+
+    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
+    margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.
+    Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
+    """
+    name = chosen.added[0]
+    project = Projection(state.optimum.moving * state.model.spread)
+    (effect,) = [one for one in chosen.model.effects if one.name == name]
+    own = signature_of(state.model, state.optimum.x, state.whitening, project, effect)
+    where = chosen.places(name)
+    amplitude = chosen.optimum.x[where] / chosen.model.spread[where]
+    out = [name]
+    fitted = {one.added[0]: one for one in refits}
+    for one in seen.traced:
+        if one.name == name or one.card.place == "generic" or not one.signatures:
+            continue
+        if one.name in fitted:
+            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
+                out.append(one.name)
+            continue
+        if chosen.whitening.dependence:
+            continue
+        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
+        if margin < MARGIN:
+            out.append(one.name)
+    return tuple(out)
 
 
 def single_record(study: Study) -> tuple[str, ...]:

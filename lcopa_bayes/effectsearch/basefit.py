@@ -11,7 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import AxisNoise, axis_noise, joint_noise
+from lcopa_bayes.effectsearch.noise import AxisNoise, axis_noise, joint_noise, no_less
 from lcopa_bayes.effectsearch.noiselaw import Law, plausible
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
@@ -27,7 +27,7 @@ _DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
 """Shares of the fitted delays by which the descent is started again later: delays can jump [-]."""
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
-_ROUNDS = 3
+_ROUNDS, _TURNS = 3, 8
 _OUT = 1.5
 """Mean square of a residual that is more than noise [variance of the noise]: where samples at rest know that
 to 20 %, noise alone stays below."""
@@ -133,14 +133,15 @@ def _guessed(posterior: Posterior) -> tuple[Law, ...]:
 
 
 def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
-    """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
+    """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it, or where
+    that is hardly more than what rounding leaves."""
     out = []
     scales = fitted_scales(posterior)
     for axis, response in enumerate(posterior.table.layout.responses):
+        own = axis_pieces(posterior, residual, axis)
         noise = axis_noise(posterior.samples, axis, delay, response, scales)
-        if isinstance(noise, str):
-            noise = joint_noise(axis_pieces(posterior, residual, axis), response, noise, scales)
-        out.append(noise)
+        noise = no_less(noise, own, response, scales.least_noise(axis))
+        out.append(joint_noise(own, response, noise, scales) if isinstance(noise, str) else noise)
     return tuple(out)
 
 
@@ -149,7 +150,8 @@ def whitening(model: ExtendedModel, noise: Sequence[AxisNoise]) -> Whitening:
     laws = tuple(one.law for one in noise)
     known = tuple(one.posterior for one in noise)
     dependence = () if all(one.known for one in noise) else tuple(one.dependence for one in noise)
-    return Whitening(model.plant.samples, laws, dependence, known)
+    least = all(one.least for one in noise)
+    return Whitening(model.plant.samples, laws, dependence, known, least)
 
 
 def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whitening:
@@ -160,9 +162,22 @@ def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whiteni
     return whitening(model, measured(model.plant, optimum.residual, delay))
 
 
+def in_turn(model: ExtendedModel, optimum: Optimum, known: Whitening) -> tuple[Optimum, Whitening]:
+    """Optimum and noise, each as the other gives it, where the noise had to be fitted jointly."""
+    for _ in range(_TURNS):
+        white = renewed(model, optimum, known)
+        pairs = zip(white.noise, known.noise, strict=True)
+        if white is known or all(_near(one, other) for one, other in pairs):
+            break
+        known, optimum = white, Regression(model, white).descend(optimum.x)
+    return optimum, known
+
+
 def settled(model: ExtendedModel, optimum: Optimum, known: Whitening) -> tuple[Optimum, Whitening]:
     """Optimum and noise where nothing stands out from the noise that was measured: then all of the residual
-    is noise, and knows it better than samples at rest do."""
+    is noise, and knows it better than samples at rest do. Where there is none to speak of they stay."""
+    if known.least:
+        return optimum, known
     posterior = model.plant
     scales = fitted_scales(posterior)
     pieces = (axis_pieces(posterior, optimum.residual, axis) for axis in range(len(known.noise)))
@@ -183,7 +198,11 @@ def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observ
 
 
 def _alike(one: AxisNoise, other: AxisNoise) -> bool:
-    return one.samples == other.samples and abs(one.law.sd / other.law.sd - 1) < 0.01
+    return one.samples == other.samples and _near(one.law, other.law)
+
+
+def _near(one: Law, other: Law) -> bool:
+    return abs(one.sd / other.sd - 1) < 0.01
 
 
 def too_smooth(optimum: Optimum) -> bool:

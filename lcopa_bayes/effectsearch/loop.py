@@ -227,9 +227,9 @@ class _Begun:
             crew=options.crew,
         )
         result = rounds(start, noise_samples=fit.noise_samples, first=self.base.look)
-        if fit.noise_known and not result.rounds[-1].trace.alarmed:
+        if not result.rounds[-1].trace.alarmed:
             result = result.settled
-            if not all(one.firm for one in fit.noise) and not result.state.model.effects:
+            if fit.noise_known and not all(one.firm for one in fit.noise) and not result.state.model.effects:
                 # too few samples at rest leave noise plausible in which every effect drowns
                 result = rounds(result.state, noise_samples=(0,) * len(fit.noise)).settled
         return replace(result, state=released(result.state))

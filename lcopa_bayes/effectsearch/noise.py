@@ -58,7 +58,7 @@ class AxisNoise:
     samples: int
     """Samples it was estimated from [-]."""
     source: str
-    """One of "quiet", "repeats", "joint"."""
+    """One of "quiet", "repeats", "joint", "least"."""
     sentence: str
     dependence: float = 1.0
     """Samples that count as one independent sample [-]; above 1 only when fitted jointly."""
@@ -93,8 +93,13 @@ class AxisNoise:
         )
 
     @property
+    def least(self) -> bool:
+        """Whether it is the least noise that is considered."""
+        return self.source == "least"
+
+    @property
     def known(self) -> bool:
-        """Whether it was measured apart from the fit."""
+        """Whether it is known apart from the fit."""
         return self.source != "joint"
 
 
@@ -215,6 +220,27 @@ def joint_noise(residual: Sequence[Observed], response: Axis, why: str, scales: 
         "there, so no verdict is better than tentative."
     )
     return AxisNoise(law, coloured, count, "joint", sentence, dependence)
+
+
+def no_less(
+    noise: AxisNoise | str, residual: Sequence[Observed], response: Axis, least: float
+) -> AxisNoise | str:
+    """Noise of an axis, or why samples at rest do not tell it, but noise of an sd of `least` [response unit]
+    where theirs is less, or the residual.
+
+    What records of a simulation leave is the error to which a response is calculated: it is no noise, and
+    has the shape of many effects.
+    """
+    pieces = [piece.values for piece in residual]
+    count = sum(piece.size for piece in pieces)
+    error = float(np.sqrt(sum(float((piece**2).sum()) for piece in pieces) / count))
+    if min(error, np.inf if isinstance(noise, str) else noise.law.sd) >= least:
+        return noise
+    sentence = (
+        f"{response.name}: samples have no noise above {measured(least, response.unit)}, a millionth of "
+        "their range; nothing smaller is looked for."
+    )
+    return AxisNoise(Law(least), PlausibleNoise.white(least, count), count, "least", sentence)
 
 
 def _dependence(pieces: Sequence[Vector], coloured: Law) -> float:

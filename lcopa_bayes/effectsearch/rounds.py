@@ -10,8 +10,8 @@ from typing import NamedTuple, Self, final
 import numpy as np
 
 from lcopa_bayes.core.crew import ALONE, Crew
-from lcopa_bayes.effectsearch.acceptance import accepted, beside_dynamics, large, leader
-from lcopa_bayes.effectsearch.basefit import settled
+from lcopa_bayes.effectsearch.acceptance import accepted, beside_dynamics, group, large, leader
+from lcopa_bayes.effectsearch.basefit import in_turn, settled
 from lcopa_bayes.effectsearch.candidates import followed, refitted, rough
 from lcopa_bayes.effectsearch.effectpairs import both, paired
 from lcopa_bayes.effectsearch.refits import (
@@ -24,11 +24,6 @@ from lcopa_bayes.effectsearch.refits import (
 )
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.signature import (
-    Projection,
-    expected_margin,
-    signature_of,
-)
 from lcopa_bayes.effectsearch.trace import Trace, trace
 from lcopa_bayes.effectsearch.verdict import AHEAD, FIRM, MARGIN
 from lcopa_bayes.model.effects.effect import Effect
@@ -172,11 +167,14 @@ class Search:
 
     @property
     def settled(self) -> Self:
-        """The same under the noise that its residual has, unless something stands out from the noise."""
+        """The same under the noise that its residual has, unless something stands out from the noise; where
+        that was fitted jointly it is found in turn with the model."""
+        state = self.state
         if self.rounds[-1].trace.alarmed:
             return self
-        optimum, whitening = settled(self.state.model, self.state.optimum, self.state.whitening)
-        return replace(self, state=replace(self.state, optimum=optimum, whitening=whitening))
+        again = in_turn if state.whitening.dependence else settled
+        optimum, whitening = again(state.model, state.optimum, state.whitening)
+        return replace(self, state=replace(state, optimum=optimum, whitening=whitening))
 
 
 def search(
@@ -366,33 +364,3 @@ def in_proportion(state: State) -> State:
             break
         state = replace(state, model=model, optimum=optimum)
     return state
-
-
-def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:
-    """Names that these records confound with the chosen one, its own first.
-
-    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
-    margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.
-    Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
-    """
-    name = chosen.added[0]
-    project = Projection(state.optimum.moving * state.model.spread)
-    (effect,) = [one for one in chosen.model.effects if one.name == name]
-    own = signature_of(state.model, state.optimum.x, state.whitening, project, effect)
-    where = chosen.places(name)
-    amplitude = chosen.optimum.x[where] / chosen.model.spread[where]
-    out = [name]
-    fitted = {one.added[0]: one for one in refits}
-    for one in seen.traced:
-        if one.name == name or one.card.place == "generic" or not one.signatures:
-            continue
-        if one.name in fitted:
-            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
-                out.append(one.name)
-            continue
-        if chosen.whitening.dependence:
-            continue
-        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
-        if margin < MARGIN:
-            out.append(one.name)
-    return tuple(out)

@@ -164,7 +164,8 @@ def trace(
     model, optimum, whitening = state.model, state.optimum, state.whitening
     project = Projection(optimum.moving * model.spread)
     residual = project(optimum.settled)
-    quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
+    quiet = float(whitening.size if whitening.least else sum(noise_samples))
+    freedom = whitening.effective - optimum.x.size
     scale = Scale(quiet, freedom, np.array([residual @ residual]))
     present = {effect.name for effect in model.effects}
     layout = model.plant.table.layout
@@ -228,8 +229,10 @@ def _traced(known: tuple[State, Projection, Vector, Scale], kind: type[Effect]) 
     state, project, residual, scale = known
     whitening = state.whitening
     if issubclass(kind, ScatterEffect):
-        joint = "the noise is known from the residual alone" if whitening.dependence else ""
-        return Traced(kind.card, (), -np.inf if joint else scatter_evidence(state.optimum.white), 0, joint)
+        unknown = "the noise is known from the residual alone" if whitening.dependence else ""
+        unknown = "there is no noise" if whitening.least else unknown
+        scatter = -np.inf if unknown else scatter_evidence(state.optimum.white)
+        return Traced(kind.card, (), scatter, 0, unknown)
     commands = max(commands_of(one.record.drive) for one in whitening.samples) if kind.per_command else 0
     if commands > MOST_COMMANDS:
         why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"

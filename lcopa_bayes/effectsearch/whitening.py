@@ -79,6 +79,8 @@ class Whitening:
     """Samples that count as one independent sample, per response axis; 1 by default [-]."""
     posterior: tuple[PlausibleNoise, ...] = ()
     """What is known of the noise of each response axis; by default it is `noise`."""
+    least: bool = False
+    """Whether that of every axis is the least noise that is considered, which a residual does not scale."""
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:

@@ -54,6 +54,8 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Observed, QuietNoise, Samples, quiet_noise, sampling_period
 from lcopa_bayes.inference.priors import Prior
 
+_LEAST = 1e-6
+"""Standard deviation of the least noise that is considered, over the range of a response [-]."""
 _TIMES = 20.0
 """Correlation times of the noise that fit into a record at least [-]."""
 _SHORTEST, _SHORT = 1.0, 2.0
@@ -134,8 +136,12 @@ class Scales:
 
     def sigma(self, response: int) -> Prior:
         """Prior of a noise scale."""
-        amplitude = float(self.amplitude[response])
-        return Prior("loguniform", {"a": 1e-6 * amplitude, "b": 2 * amplitude})
+        ends = {"a": self.least_noise(response), "b": 2 * float(self.amplitude[response])}
+        return Prior("loguniform", ends)
+
+    def least_noise(self, response: int) -> float:
+        """Standard deviation of the least noise that is considered [response unit]."""
+        return _LEAST * float(self.amplitude[response])
 
     @staticmethod
     def rho() -> Prior:
@@ -143,10 +149,14 @@ class Scales:
         return Prior("uniform", {"loc": 0.0, "scale": 1.0})
 
     def quiet(self, response: int) -> QuietNoise | None:
-        """Noise of an axis as its samples at rest give it; None where these are too few."""
+        """Noise of an axis as its samples at rest give it; None where these are too few, or have no noise but
+        what rounding leaves."""
         if response not in self._quiet:
             pieces = [piece for piece in self.at_rest[response] if piece.values.size > 1]
-            self._quiet[response] = quiet_noise(pieces, self.correlations)
+            found = quiet_noise(pieces, self.correlations)
+            least = self.least_noise(response)
+            exact = found is not None and max(found.sigma, found.correlated) < least
+            self._quiet[response] = None if exact else found
         return self._quiet[response]
 
     @cached_property

@@ -255,6 +255,12 @@ class PlausibleNoise:
         return cls._weighed(shapes, log_density, squares, max(1.0, count))
 
     @classmethod
+    def white(cls, sd: float, count: int) -> PlausibleNoise:
+        """White noise of a standard deviation [response unit] that so many samples know."""
+        shape = np.array([[1.0, 0.0, 0.0]])
+        return cls(shape, np.ones(1), np.array([count * sd**2]), float(count))
+
+    @classmethod
     def _weighed(cls, shapes: Matrix, log_density: Vector, squares: Vector, count: float) -> PlausibleNoise:
         """With the scale integrated out."""
         weight = log_density - 0.5 * count * np.log(squares)
