@@ -116,7 +116,8 @@ def _raced(
     """The refit of each effect, to the end where a few evaluations leave it near the best and above a `least`
     evidence [nat], or why there is none."""
     starts = dict(zip(tasks, known.each(_begun, list(tasks.values())), strict=True))
-    best = max((one.worth for own in starts.values() for one in own if isinstance(one, Refit)), default=0.0)
+    several = (own for own in starts.values() if not isinstance(own, str))
+    best = max((one.worth for own in several for one in own), default=0.0)
     bar = max(least, min(_BEHIND * best, best - _FAR_BEHIND))
     return dict(zip(starts, known.each(_ended, [(own, bar) for own in starts.values()]), strict=True))
 
