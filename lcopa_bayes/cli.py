@@ -128,9 +128,8 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
             print(f"{options.verb}: loading", file=sys.stderr, flush=True)
         if options.jobs != 1:
             imported_ahead(_module(options.verb), "lcopa_bayes.report.pages")
-    from lcopa_bayes.core.files import trusting
+    from lcopa_bayes.core.files import commanded, trusting
     from lcopa_bayes.core.parallel import on_cluster
-    from lcopa_bayes.results.runfolder import commanded
 
     with (
         commanded(command),

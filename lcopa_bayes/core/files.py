@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -29,6 +29,7 @@ _DOTS = 200
 _FORMULA = re.compile(r"'*(?:[=@\t\r]|[+-](?![\d.eE+-]*\Z))")
 """How a text begins that a spreadsheet takes for a formula, or that `csv_of` made of one."""
 _TRUSTED: ContextVar[bool] = ContextVar("_TRUSTED", default=False)
+_COMMAND: ContextVar[tuple[str, ...]] = ContextVar("_COMMAND", default=())
 _TRUST = "if you trust its author, allow this with --trust, from Python with `load_study(..., trust=True)`"
 _REMEDY = f"make it writable {ELSEWHERE}"
 
@@ -181,3 +182,18 @@ def _misplaced(key: str, value: object, known: Collection[str]) -> str:
     if all(isinstance(one, dict) for one in entries):
         return f"unknown table [{key}]{nearest(key, known)}"
     return f"key {key!r} stands above all tables; put it below the one it belongs to: [{'], ['.join(known)}]"
+
+
+@contextmanager
+def commanded(command: Sequence[str]) -> Iterator[None]:
+    """Within it, files say that this command line asked for them."""
+    token = _COMMAND.set(tuple(command))
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
+def command_line() -> tuple[str, ...]:
+    """The command line being executed; empty when a function was called from Python."""
+    return _COMMAND.get()

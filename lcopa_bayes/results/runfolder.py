@@ -9,9 +9,8 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from contextvars import ContextVar
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +20,14 @@ import numpy as np
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.files import read_json, remove_unfinished, save_json, writable_folder, writing
+from lcopa_bayes.core.files import (
+    command_line,
+    read_json,
+    remove_unfinished,
+    save_json,
+    writable_folder,
+    writing,
+)
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.sampling.run import SamplePlan
@@ -169,8 +175,6 @@ _PACKAGES = (
     "pandas",
     "xarray",
 )
-_COMMAND: ContextVar[tuple[str, ...]] = ContextVar("_COMMAND", default=())
-"""The command line being executed; empty when a function was called from Python."""
 
 
 def settings_of(study: Study) -> dict[str, Any]:
@@ -210,16 +214,6 @@ def digest(record: Record) -> str:
     return held.hexdigest()
 
 
-@contextmanager
-def commanded(command: Sequence[str]) -> Iterator[None]:
-    """Within it, results say that this command line asked for them."""
-    token = _COMMAND.set(tuple(command))
-    try:
-        yield
-    finally:
-        _COMMAND.reset(token)
-
-
 def provenance(study: Study | None, verb: str) -> dict[str, Any]:
     """What another person needs to get the same numbers: command line, or the function that was called, seed,
     settings, hashes of records and input files, versions. Without a study, of the paper's printed numbers."""
@@ -233,7 +227,7 @@ def provenance(study: Study | None, verb: str) -> dict[str, Any]:
             "inputs_sha256": dict(study.inputs),
         }
     return {
-        "command": list(_COMMAND.get() or (f"lcopa_bayes.{verb}",)),
+        "command": list(command_line() or (f"lcopa_bayes.{verb}",)),
         **own,
         "python": platform.python_version(),
         "versions": {name: version(name) for name in _PACKAGES},

@@ -7,13 +7,17 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lcopa_bayes.core.errors import InputError, nearest
 
+if TYPE_CHECKING:
+    from lcopa_bayes.model.effects.effect import Card
+
 
 def explain(term: str, *, runs: Path | str = "runs") -> str:
-    """What a term of pages and messages means, in at most three lines, and an example.
+    """What a term of pages and messages means, in at most three lines, and an example; of an effect its
+    formula, and what shows it.
 
     Parameters: `term`, in any case, or a word close to it; `runs`, folder of run folders, of which the last
     fit gives the example. InputError for an unknown term, with the nearest known one.
@@ -24,12 +28,28 @@ def explain(term: str, *, runs: Path | str = "runs") -> str:
     names = {word.casefold(): name for name, one in glossary.items() for word in (name, *one["words"])}
     wanted = term.casefold().strip()
     if wanted not in names:
-        hint = nearest(wanted, names)
+        from lcopa_bayes.model.effects.catalogue import catalogue  # takes seconds to load
+
+        effects = {name.casefold(): kind.card for name, kind in catalogue().items()}
+        effect = wanted.replace(" ", "_")
+        if effect in effects:
+            return _effect(effects[effect])
+        hint = nearest(wanted, [*names, *effects])
         hint = hint if "did you mean" in hint else nearest(wanted, glossary)
         raise InputError(f"{term!r} is not a known term{hint}")
     entry = glossary[names[wanted]]
     parts = [f"{names[wanted]}: {entry['text'].strip()}", _example(entry["example"], Path(runs))]
     return "\n".join(part for part in parts if part)
+
+
+def _effect(card: Card) -> str:
+    """An effect of the catalogue in three lines."""
+    acting = "without a name" if card.place == "generic" else f"that acts on the {card.place}"
+    return (
+        f"{card.name}: an effect {acting}: {card.formula}.\n"
+        f"Shown by {card.reveals}; else mistaken for {card.mistaken_for}.\n"
+        f"Source: {card.source}."
+    )
 
 
 def _example(sentence: str, runs: Path) -> str:

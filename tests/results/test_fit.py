@@ -14,9 +14,10 @@ from small import TRUTH, record, study
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.files import commanded
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import HOPELESS, Fit, fit, plan_of
-from lcopa_bayes.results.runfolder import commanded, fingerprint, provenance
+from lcopa_bayes.results.runfolder import fingerprint, provenance
 from lcopa_bayes.results.summary import residual_rms, results, verdict
 from lcopa_bayes.sampling.run import SamplePlan
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import version
 from importlib.resources import files
@@ -13,6 +15,7 @@ import pytest
 import lcopa_bayes as lb
 from lcopa_bayes.cli import VERBS, _parser, main
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.model.effects.catalogue import bundled
 from lcopa_bayes.verbs.commandline import USAGES
 
 TERMS = tomllib.loads(files("lcopa_bayes.verbs").joinpath("glossary.toml").read_text(encoding="utf-8"))
@@ -92,6 +95,39 @@ def test_an_unknown_term_is_answered_by_the_nearest_or_by_the_terms_there_are(tm
     with pytest.raises(InputError) as refused:
         lb.explain("zzzzqq", runs=tmp_path)
     assert str(refused.value).endswith(f"known: {', '.join(sorted(TERMS))}")
+
+
+@pytest.mark.parametrize("name", bundled())
+def test_an_effect_is_explained_by_its_card(name, tmp_path):
+    card = bundled()[name].card
+    text = lb.explain(name.upper().replace("_", " "), runs=tmp_path)
+    assert text.startswith(f"{name}: an effect ")
+    assert len(text.splitlines()) == 3
+    for said in (card.formula, card.reveals, card.mistaken_for, card.source):
+        assert said in text
+    assert (f"acts on the {card.place}" in text) == (card.place != "generic")
+    assert name not in TERMS
+
+
+def test_an_unknown_effect_is_answered_by_the_nearest(tmp_path):
+    with pytest.raises(InputError, match="did you mean 'odd_curvature'"):
+        lb.explain("od curvature", runs=tmp_path)
+
+
+def test_a_term_is_explained_without_loading_what_calculates():
+    """Which takes seconds."""
+    heavy = ("scipy", "pandas", "arviz_base", "sklearn", "matplotlib")
+    lines = (
+        "import sys",
+        "from lcopa_bayes.cli import main",
+        "assert main(['explain', 'grade']) == 0",
+        f"assert not {{*{heavy}}} & {{*sys.modules}}",
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("grade: ")
 
 
 def test_a_word_means_one_term():
