@@ -114,8 +114,8 @@ class Mixture:
     def _parts(self, distances: Matrix) -> tuple[Matrix, Vector]:
         """Density of each component times its weight, (components, n), over a level whose logarithm is (n,).
 
-        That level is of the component that is nearest, so that no sum underflows. By products: logarithms and
-        powers of every entry would take longer than the distances.
+        That level is of the component that is nearest, so that hardly a sum underflows. By products:
+        logarithms and powers of every entry would take longer than the distances.
         """
         here = distances if self.weights.all() else distances[self.weights > 0.0]
         nearest = here.min(axis=0)
@@ -129,11 +129,20 @@ class Mixture:
             ratio *= ratio
             remaining //= 2
         parts *= np.exp(self._levels - highest)[:, None]
-        return parts, highest - 0.5 * exponent * np.log1p(nearest / FREEDOM)
+        level = highest - 0.5 * exponent * np.log1p(nearest / FREEDOM)
+        lost = ~parts.any(axis=0)
+        if lost.any():  # beside a component so narrow that e^-700 of its density is that of the nearest
+            logarithms = self._log_parts(distances[:, lost])
+            level[lost] = logarithms.max(axis=0)
+            parts[:, lost] = np.exp(logarithms - level[lost])
+        return parts, level
 
     def log_parts(self, points: Matrix) -> Matrix:
         """Log density of each component times its weight, (components, n)."""
-        parts = np.log1p(self.distances(points) / FREEDOM)
+        return self._log_parts(self.distances(points))
+
+    def _log_parts(self, distances: Matrix) -> Matrix:
+        parts = np.log1p(distances / FREEDOM)
         parts *= -0.5 * (FREEDOM + self.dimension)
         parts += self._levels[:, None]
         return parts

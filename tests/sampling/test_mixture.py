@@ -179,6 +179,17 @@ def test_products_give_what_logarithms_give(dimension, far, rng):
     assert_allclose(shares, np.exp(mixture.log_shares(points)), rtol=1e-9, atol=1e-60)
 
 
+def test_a_component_of_hardly_any_width_leaves_the_density_of_the_others(rng):
+    """That of a component of a width of 1e-60 is e^800 times that of the other, which a point is near."""
+    factors = np.array([np.eye(6), 1e-60 * np.eye(6)])
+    mixture = Mixture(np.array([0.5, 0.5]), np.array([np.zeros(6), 3.0 * np.ones(6)]), factors)
+    points = rng.standard_normal((20, 6))
+    alone = stats.multivariate_t(np.zeros(6), np.eye(6), df=FREEDOM)
+    assert_allclose(mixture.log_density(points), alone.logpdf(points) + np.log(0.5), rtol=1e-12)
+    assert_allclose(mixture.shares(mixture.distances(points)), [[1.0] * 20, [0.0] * 20], atol=1e-300)
+    assert mixture.log_density(3.0 * np.ones((1, 6)))[0] > 700.0
+
+
 def test_points_are_spread_evenly():
     points = np.arange(100.0)[:, None]
     assert_array_equal(spread_evenly(points, 200), points)
