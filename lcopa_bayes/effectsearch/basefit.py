@@ -28,6 +28,7 @@ _DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS, _TURNS = 3, 8
+"""Most times that noise and plant are found in turn, without effects and with them [-]."""
 _OUT = 1.5
 """Mean square of a residual that is more than noise [variance of the noise]: where samples at rest know that
 to 20 %, noise alone stays below."""

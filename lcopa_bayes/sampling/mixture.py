@@ -128,10 +128,11 @@ class Mixture:
                 parts *= ratio
             ratio *= ratio
             remaining //= 2
-        parts *= np.exp(self._levels - highest)[:, None]
+        relative = np.exp(self._levels - highest)
+        parts *= relative[:, None]
         level = highest - 0.5 * exponent * np.log1p(nearest / FREEDOM)
-        lost = ~parts.any(axis=0)
-        if lost.any():  # beside a component so narrow that e^-700 of its density is that of the nearest
+        if not relative[self.weights > 0.0].all():  # beside one so narrow that it is e^700 times as dense
+            lost = ~parts.any(axis=0)
             logarithms = self._log_parts(distances[:, lost])
             level[lost] = logarithms.max(axis=0)
             parts[:, lost] = np.exp(logarithms - level[lost])

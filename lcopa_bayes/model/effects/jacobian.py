@@ -71,12 +71,14 @@ def coefficient_slopes(
     effect bends is the slope itself. Raises UnstableError where the response there is not bounded.
     """
     differences = _differences(simulator, psi, last=last)
+    cases = _cases(plant, psi, differences)
     try:
-        read = simulator.moved_together(_cases(plant, psi, differences))
+        moved = simulator.moved_together(cases)
     except UnstableError:
         differences = [one.to_one_side(simulator, plant, psi) for one in differences]
-        read = simulator.moved_together(_cases(plant, psi, differences))
-    return _by_coefficient(simulator, psi, differences, read)
+        cases = _cases(plant, psi, differences)
+        moved = simulator.moved_together(cases)
+    return _by_coefficient(simulator, differences, cases, moved)
 
 
 def slopes(
@@ -87,13 +89,11 @@ def slopes(
     if simulator.bends(psi):
         numbers, differences = list(_numbers(simulator, plant)), _differences(simulator, psi)
         with suppress(UnstableError):  # else each on its own, to the side where there is a response
-            cases = [*_with_each(plant, psi, numbers), *_cases(plant, psi, differences)[1:]]
-            moved = simulator.moved_together(cases)
-            by_number, steps = moved[: len(numbers) + 1], moved[len(numbers) + 1 :]
-            return (
-                _by_number(simulator, psi, numbers, by_number),
-                _by_coefficient(simulator, psi, differences, [moved[0], *steps]),
-            )
+            cases, others = _cases(plant, psi, differences), _with_each(plant, psi, numbers)[1:]
+            moved = simulator.moved_together([*cases, *others])
+            steps, changed = moved[: len(cases)], moved[len(cases) :]
+            by_number = _by_number(simulator, psi, numbers, [moved[0], *changed])
+            return by_number, _by_coefficient(simulator, differences, cases, steps)
     return plant_slopes(simulator, plant, psi), coefficient_slopes(simulator, plant, psi)
 
 
@@ -135,13 +135,15 @@ def _cases(plant: Plant, psi: Vector, differences: Sequence[_Difference]) -> lis
 
 
 def _by_coefficient(
-    simulator: Simulator, psi: Vector, differences: Sequence[_Difference], moved: Sequence[Sequence[Moved]]
+    simulator: Simulator,
+    differences: Sequence[_Difference],
+    cases: Sequence[tuple[Plant, Vector]],
+    moved: Sequence[Sequence[Moved]],
 ) -> list[Matrix]:
     """Slopes per record, from the records of `_cases` up to their reading."""
     here = moved[0]
-    cases = [psi, *(each for one in differences for each in one.cases(psi))]
     pairs = zip(moved, cases, strict=True) if differences else ()
-    read = [simulator.finished(own, each) for own, each in pairs]
+    read = [simulator.finished(own, psi) for own, (_, psi) in pairs]
     out = [np.zeros((*deflection.shape, simulator.size)) for _, deflection in here]
     base, place = read[:1], 1
     for one in differences:
