@@ -105,9 +105,7 @@ def refitted(
     ends = _raced(known, {name: tasks[name] for name in several}, _REACH * rival)
     if any(isinstance(end, Refit) and end.log_bayes_factor >= rival for end in ends.values()):
         ends |= _raced(known, {name: tasks[name] for name in dynamics}, _REACH * rival)
-    done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
-    failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
-    return under_one_noise(done), failures
+    return _parted(state, ends)
 
 
 def _raced(
@@ -122,14 +120,18 @@ def _raced(
     return dict(zip(starts, known.each(_ended, [(own, bar) for own in starts.values()]), strict=True))
 
 
-def followed(state: State, refits: Sequence[Refit], crew: Crew = ALONE) -> list[Refit]:
-    """All of these refits of a state at their optima, by falling evidence."""
-    ends = crew.sharing(state).each(_followed, list(refits))
-    return under_one_noise([_beside(state, one) for one in ends])
+def followed(state: State, refits: Sequence[Refit], crew: Crew = ALONE) -> tuple[list[Refit], list[str]]:
+    """These refits of a state at their optima, by falling evidence; what has none and why."""
+    names = [", ".join(one.added) for one in refits]
+    ends = crew.sharing((state, np.inf, False)).each(_ended, [([one], -np.inf) for one in refits])
+    return _parted(state, dict(zip(names, ends, strict=True)))
 
 
-def _followed(state: State, one: Refit) -> Refit:
-    return ended(one)
+def _parted(state: State, ends: Mapping[str, Refit | str]) -> tuple[list[Refit], list[str]]:
+    """Refits of a state by falling evidence, and why there are no others."""
+    done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
+    failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
+    return under_one_noise(done), failures
 
 
 def _begun(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> list[Refit] | str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple, Self, final
+from typing import Self, final
 
 import numpy as np
 
@@ -63,7 +63,8 @@ class Round:
 
     def followed(self, crew: Crew) -> Self:
         """With all of its refits at their optima."""
-        return replace(self, refits=tuple(followed(self.state, self.refits, crew)))
+        refits, failures = followed(self.state, self.refits, crew)
+        return replace(self, refits=tuple(refits), failures=(*self.failures, *failures))
 
     @property
     def leading(self) -> Refit | None:
@@ -212,7 +213,9 @@ def search(
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
         pair = _pair(rounds[0], rounds[-1].state, looking, better)
         if pair is not None:
-            return Search.ending([*rounds, *pair.rounds], lambda: _groups(pair.kept, looking, crew))
+            kept, look = pair
+            added = replace(rounds[0], refits=(kept,), failures=(), chosen=kept)
+            return Search.ending([*rounds, added, look], lambda: _groups(kept, looking, crew))
     return Search.ending(rounds, lambda: _groups_one_by_one(rounds))
 
 
@@ -285,20 +288,12 @@ def _groups_one_by_one(rounds: Sequence[Round]) -> dict[str, tuple[str, ...]]:
     return {chosen.added[0]: group(one.state, chosen, one.refits, one.trace) for one, chosen in added}
 
 
-@final
-class _Paired(NamedTuple):
-    """A pair of effects, or the one of them that does as well alone."""
-
-    kept: Refit
-    rounds: tuple[Round, Round]
-    """That adds it, and the look at what it leaves."""
-
-
 def _pair(
     first: Round, state: State, looking: Callable[[State], Round], better: Callable[[State, State], bool]
-) -> _Paired | None:
-    """A pair of effects added at once to what the `first` round looked at, where that beats a `state` with
-    effects that were found one by one; else None."""
+) -> tuple[Refit, Round] | None:
+    """A pair of effects added at once to what the `first` round looked at, or the one of them that does as
+    well alone, and the look at what it leaves, where that beats a `state` with effects that were found one by
+    one; else None."""
     pair = paired(first.state, state, first.trace)
     if pair is None:
         return None
@@ -308,7 +303,7 @@ def _pair(
         return None
     if kept is not pair:
         look = looking(in_proportion(kept.state))
-    return _Paired(kept, (replace(first, refits=(kept,), failures=(), chosen=kept), look))
+    return kept, look
 
 
 def _groups(chosen: Refit, looking: Callable[[State], Round], crew: Crew) -> dict[str, tuple[str, ...]]:

@@ -60,9 +60,27 @@ def test_only_what_may_be_ahead_is_refitted_to_its_end(near, monkeypatch):
     for one in some:  # an end is no lower than where it began
         assert one.log_bayes_factor <= known[one.added].log_bayes_factor + 0.05
         assert bool(one.glances) or one.optimum.cost == known[one.added].optimum.cost
-    after = followed(first.state, some)
+    after, failures = followed(first.state, some)
+    assert not failures
     assert [one.added for one in after] == [one.added for one in every]
     assert [one.optimum.cost for one in after] == [known[one.added].optimum.cost for one in after]
+
+
+def test_a_refit_that_has_no_end_is_a_failure_and_no_traceback(near, monkeypatch):
+    """Where it was only begun and nothing ahead of it is accepted."""
+    first = look().refitted(ALONE)
+    begun_only = next(one for one in first.refits if one.glances)
+
+    def unbounded(one: Refit) -> Refit:
+        if one.added == begun_only.added:
+            raise FloatingPointError("the simulated response is not finite")
+        return ended(one)
+
+    monkeypatch.setattr(candidates, "ended", unbounded)
+    after = first.followed(ALONE)
+    assert begun_only.added not in [one.added for one in after.refits]
+    assert not any(one.glances for one in after.refits)
+    assert after.failures == (*first.failures, f"{begun_only.added[0]}: the simulated response is not finite")
 
 
 def test_a_refit_that_was_only_begun_ends_where_one_at_once_does():
