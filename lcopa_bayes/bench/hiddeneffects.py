@@ -121,6 +121,8 @@ class Hidden:
     """[ms]."""
     seen: Callable[[Matrix, Vector, Command, Shot], Matrix] | None = None
     """(deflections, times, command that acts, shot) -> deflections."""
+    turns: bool = False
+    """Whether `seen` is given the deflections where commands begin to act, too, among those of `times`."""
     noise: Callable[[Matrix, np.random.Generator], Matrix] | None = field(default=None)
     """From noise to noise, (n, axes)."""
 
@@ -149,10 +151,14 @@ class HiddenDevice:
         device = stretched(self.device, float(np.prod(factors)))
         exposure += sum(effect.exposure for effect in self.effects)
         lags = [effect.lag for effect in self.effects if effect.lag > 0]
-        at = times
+        wanted = times
+        if any(effect.turns for effect in self.effects):
+            begins = acting(command, shot)
+            wanted = np.union1d(times, begins[(times[0] <= begins) & (begins <= times[-1])])
+        at = wanted
         if lags:  # a lag is integrated between the samples
-            inner = times[:-1, None] + np.diff(times)[:, None] * np.arange(_FINE) / _FINE
-            at = np.append(inner.ravel(), times[-1])
+            inner = wanted[:-1, None] + np.diff(wanted)[:, None] * np.arange(_FINE) / _FINE
+            at = np.append(inner.ravel(), wanted[-1])
         y = device.response(command, at, exposure=exposure) - offsets
         balances = [effect.balance for effect in self.effects if effect.balance is not None]
         if balances:
@@ -163,11 +169,16 @@ class HiddenDevice:
         for lag in lags:
             y = _lagging(at, y, lag)
         if lags:
-            y = y[np.searchsorted(at, times - 1e-9)]
+            y = y[::_FINE]
         for effect in self.effects:
             if effect.seen is not None:
-                y = effect.seen(y, times, command, shot)
-        return np.asarray(y + offsets)
+                y = effect.seen(y, wanted, command, shot)
+        return np.asarray(y[np.searchsorted(wanted, times)] + offsets)
+
+
+def acting(command: Command, shot: Shot) -> Vector:
+    """When changes of the command begin to act on the direct paths [ms]."""
+    return np.asarray(command.times + shot.delay)
 
 
 def stretched(device: Device, factor: float) -> Device:

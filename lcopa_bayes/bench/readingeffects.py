@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.driveeffects import signed, unsigned
-from lcopa_bayes.bench.hiddeneffects import Hidden, Shot
+from lcopa_bayes.bench.hiddeneffects import Hidden, Shot, acting
 from lcopa_bayes.core.arrays import Matrix, Vector
 
 Seen = Callable[[Matrix, Vector, Command, Shot], Matrix]
@@ -76,13 +75,12 @@ def cross_fade(rng: np.random.Generator) -> Hidden:
     strength = float(rng.uniform(0.3, 1.0))
 
     def seen(y: Matrix, times: Vector, command: Command, shot: Shot) -> Matrix:
-        begins = np.append(command.times + shot.delay, np.inf)
-        path = CubicSpline(times, y)
+        begins = np.append(acting(command, shot), np.inf)
+        where = np.searchsorted(times, begins).clip(max=times.size - 1)
         late = np.zeros((times.size, y.shape[1]))
         lag = np.zeros(y.shape[1])
         for k, target in enumerate(command.values @ shot.steady.T):
-            origin = path(np.clip(begins[k], times[0], times[-1]))
-            end = path(np.clip(begins[k + 1], times[0], times[-1]))[None]
+            origin, end = y[where[k]], y[where[k + 1], None]
             rows = (times >= begins[k]) & (times < begins[k + 1])
             for axis in range(y.shape[1]):
                 change = target[axis] - origin[axis]
@@ -90,7 +88,7 @@ def cross_fade(rng: np.random.Generator) -> Hidden:
                 lag[axis] = _late(end[:, axis] - origin[axis], change, lag[axis], strength)[0]
         return y + late
 
-    return Hidden("cross_fade", {"strength": strength}, seen=seen)
+    return Hidden("cross_fade", {"strength": strength}, seen=seen, turns=True)
 
 
 def _late(moved: Vector, change: float, lag: float, strength: float) -> Vector:

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small import study
 
 from lcopa_bayes.bench.device import Bench, truth
@@ -15,6 +16,7 @@ from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, rich_schedules, sh
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.model.effects.catalogue import bundled
+from lcopa_bayes.model.effects.response import CrossFade
 
 DEVICE = steerer(np.random.default_rng(1))
 CHOSEN = ((0, 50.0), (5, 60.0), (8, 50.0))
@@ -138,6 +140,33 @@ def test_a_turn_in_the_tail_of_a_step_is_one():
         exact = HiddenDevice(DEVICE, hidden, shot).response(commands[r], times)
         other = exact - DEVICE.response(commands[r], times)
         assert np.sqrt(np.nanmean((told[r] - plain[r] - other) ** 2)) < most * NOISE
+
+
+@pytest.mark.parametrize("skipped", [0, 3, 7])
+def test_a_transition_starts_from_the_same_deflection_whatever_the_camera(skipped: int):
+    """The response turns where a transition starts: what a sample after it says must not count. Every tenth
+    sample, begun at different places between commands, on the bench (exact) and in the library."""
+    made, values, commands = base()
+    hidden = drawn(["cross_fade"], np.random.default_rng(3))
+    psi = np.array([hidden[0].numbers["strength"]])
+    model = made.with_effects([bundled()["cross_fade"]()])
+    y = made.responses(values, made.vanishing)
+    for r, command in enumerate(commands):
+        shot, times = shot_of(DEVICE, 0.0, np.random.default_rng(r)), made.simulator.times[r]
+        device = HiddenDevice(DEVICE, hidden, shot)
+        few = times[skipped::10]
+        assert_allclose(
+            device.response(command, few), device.response(command, times)[skipped::10], atol=1e-9
+        )
+        scene = model.simulator.scene(r, model.plant(values))
+        offsets = np.array(DEVICE.offsets)
+        fine = CrossFade().seen(y[r] - offsets, scene, psi)[skipped::10]
+        coarse = CrossFade().seen((y[r] - offsets)[skipped::10], replace(scene, times=few), psi)
+        size = np.abs(fine - (y[r] - offsets)[skipped::10]).max()
+        assert size > 5 * NOISE
+        assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.7 * NOISE
+        if np.diff(command.times).min() > 20 * 0.1:  # three samples of every transition
+            assert np.abs(coarse - fine).max() < 0.002 * size
 
 
 @pytest.mark.parametrize("name", ["cubic_stiffness", "backflow", "axis_rotation", "voltage_knee"])
