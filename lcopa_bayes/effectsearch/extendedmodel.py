@@ -207,6 +207,13 @@ class ExtendedModel:
         be exchanged may be in any sequence."""
         return self.plant.table.supported(self.plants(x))
 
+    def inside(self, x: Matrix) -> Flags:
+        """Whether all of the support holds coordinates (batch, k), (batch,)."""
+        low, high = self.bounds
+        out: Flags = np.asarray(((x >= low) & (x <= high)).all(axis=1))
+        out[out] = self.supported(x[out])
+        return out
+
     def tabulated(self, x: Matrix) -> Matrix:
         """Table values at coordinates (batch, k), (batch, rows), terms in canonical order."""
         rows = [self._least.values(one, self.template) for one in x]

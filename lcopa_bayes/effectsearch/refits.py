@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -36,7 +36,8 @@ _KEPT = 0.9
 _SLIGHT = 1.0
 """Evidence that other constants of an effect would not mend [nat]."""
 _DELAYS = (-0.25, -0.1)
-"""Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
+"""Shares of a delay by which it is also started earlier, for effects that act on the drive or that a plant
+without them has a longer delay for [-]."""
 
 
 @final
@@ -271,7 +272,7 @@ def begun(
     extended = widened(extended, added)
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
-    if any(effect.card.place == "drive" for effect, _ in added):
+    if any(map(_like_a_delay, (effect for effect, _ in added))):
         starts += [model.delayed(starts[0], share) for share in _DELAYS]
     starts = [near, *starts] if near is not None else starts
     starts = [np.clip(start, low, high) for start in starts]  # starts only
@@ -293,9 +294,27 @@ def ended(one: Refit) -> Refit:
         one.worth_at(first.cost(start)) > _SLIGHT or white.dependence
     ):  # noise known from residuals alone holds the effect too
         model, start = freed(model, start, white, names)
-    optimum = Regression(model, white).descend(start, most=12, gain=0.02)
+    exact = Regression(model, white)
+    optimum = exact.descend(start, most=12, gain=0.02)
+    if any(_like_a_delay(effect) for effect in model.effects if effect.name in names):
+        optimum = min([optimum, *_earlier(exact, optimum)], key=lambda other: other.cost)
     model, optimum = with_room(model, _no_worse(model, white, optimum, before), white, names)
     return replace(one, model=model, optimum=optimum, glances=())
+
+
+def _like_a_delay(effect: Effect) -> bool:
+    """Whether a plant without the effect has another delay in its place."""
+    return effect.card.place == "drive" or effect.card.delays
+
+
+def _earlier(regression: Regression, optimum: Optimum) -> Iterator[Optimum]:
+    """Optima from shorter delays than that of another: as much of an effect as the delay in its place had
+    left over may be an optimum of its own, by tens of nat above the best."""
+    for share in _DELAYS:
+        try:
+            yield regression.descend(regression.model.delayed(optimum.x, share), most=12, gain=0.02)
+        except ArithmeticError:  # no bounded response there
+            continue
 
 
 def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:

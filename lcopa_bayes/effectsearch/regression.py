@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple, final
@@ -25,6 +25,8 @@ _PORTION = 32
 """Plants whose responses are computed at once [-]."""
 _AT_END = 1e-3
 """Closer to an end of its support than this share of it, a coordinate is at its bound [-]."""
+_AT_ONE = 1e-7
+"""Room that is left to a coordinate that has a value [prior sd]."""
 _WALLS = 8
 """Descents between walls that move with the orders they separate, at most [-]."""
 _PUSHED = 0.3
@@ -115,6 +117,17 @@ class Regression:
         portions = (many[k : k + _PORTION] for k in range(0, len(many), _PORTION))
         return np.concatenate([np.empty(0), *map(self._costs, portions)])
 
+    def rises(self, least: float) -> Callable[[Matrix], Vector]:
+        """Costs over the `least` at coordinates (batch, k), (batch,) [nat], infinite beyond the support."""
+
+        def rises(many: Matrix) -> Vector:
+            inside = self.model.inside(many)
+            out = np.full(len(many), np.inf)
+            out[inside] = self.costs(many[inside]) - least
+            return out
+
+        return rises
+
     def _costs(self, many: Matrix) -> Vector:
         residual = self.whitening.observed - self.model.predictions(many)
         out, finite = np.full(len(many), np.inf), np.isfinite(residual).all(axis=1)
@@ -141,8 +154,7 @@ class Regression:
         for _ in range(_WALLS):
             low, high = self.model.bounds_about(x)
             width = np.where(np.isfinite(high - low), high - low, 1.0)
-            about = low - 1e-9 * width, high + 1e-9 * width  # an order may be held by both its neighbours
-            search = least.search(x, self.model.template, about, evaluations=most, enough=enough)
+            search = least.search(x, self.model.template, _wider(low, high), evaluations=most, enough=enough)
             before, x = cost, np.clip(search.x, low, high)
             cost = float(search.cost)
             near = np.minimum(x - low, high - x) < _AT_END * width
@@ -150,6 +162,27 @@ class Regression:
             if not (near & inner).any() or before - cost < gain:
                 break  # else a wall between two orders moves with them
         return self.model.canonical(x), bool(search.status > 0)
+
+    def along(self, k: int, value: float, start: Vector, *, most: int, gain: float) -> Vector:
+        """Coordinates of the optimum among those whose coordinate `k` has a `value`, after at most so many
+        evaluations from a start; errors as of `reached`."""
+        x = start.copy()
+        x[k] = value
+        x = np.clip(x, *self.model.bounds_about(x))  # a start only
+        if not np.isfinite(self.cost(x)):
+            raise FloatingPointError("the simulated response is not finite")
+        least, enough = self.model.least(self.whitening.held), 2 * gain / self.whitening.size
+        low, high = self.model.bounds_about(x)
+        ends = _wider(low, high)
+        ends[0][k], ends[1][k] = (
+            value - _AT_ONE * self.model.spread[k],
+            value + _AT_ONE * self.model.spread[k],
+        )
+        found = np.clip(
+            least.search(x, self.model.template, ends, evaluations=most, enough=enough).x, low, high
+        )
+        found[k] = value
+        return np.asarray(found)
 
     def descend(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> Optimum:
         """The optimum of `reached`, described."""
@@ -231,6 +264,12 @@ class Regression:
         """The optimum reached from the best of several starts, described; errors as of `glanced`."""
         x, converged = self.followed(self.glanced(starts, crew=crew), crew=crew)
         return self.at(x, converged=converged)
+
+
+def _wider(low: Vector, high: Vector) -> tuple[Vector, Vector]:
+    """Bounds further apart: an order may be held by both its neighbours."""
+    width = np.where(np.isfinite(high - low), high - low, 1.0)
+    return low - 1e-9 * width, high + 1e-9 * width
 
 
 @final

@@ -18,7 +18,6 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.drawsabout import (
-    _scales,
     beside_constants,
     draws_about,
     likely_draws,
@@ -26,6 +25,7 @@ from lcopa_bayes.effectsearch.drawsabout import (
 )
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.sidednormal import _scales
 from lcopa_bayes.model.path import TransferPath
 
 LAG = TransferPath.of_times(1.0, 0.0, (2.0,), (1.0,))

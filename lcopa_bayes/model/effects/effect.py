@@ -134,6 +134,8 @@ class Card:
     """Whether it stands for any such response that the plant may lack."""
     always: bool = False
     """Whether every reading has it, however small."""
+    delays: bool = False
+    """Whether a plant without it has a longer delay in its place."""
 
 
 @final

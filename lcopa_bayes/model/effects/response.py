@@ -204,6 +204,7 @@ class CrossFade(ReadoutEffect):
         reveals="interrupted steps; not an amplitude series",
         mistaken_for="delay and order together",
         fields=("optical",),
+        delays=True,
     )
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:

@@ -38,6 +38,7 @@ class SensorLag(SensorEffect):
         mistaken_for="delay and order together (97 % of it)",
         linear=True,
         always=True,
+        delays=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
@@ -95,6 +96,7 @@ class Exposure(SensorEffect):
         mistaken_for="delay of Te/2, to second order",
         linear=True,
         always=True,
+        delays=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
