@@ -71,10 +71,10 @@ def refitted(
 ) -> tuple[list[Refit], list[str]]:
     """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
-    Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
-    from the size of their prior. So are the classes of linear dynamics, which a name must beat, if any name
-    reaches a `rival` [nat]. What a few evaluations leave far below that, or below the best candidate, is not
-    refitted to the end: its evidence is a lower bound.
+    Candidates come near the best of all. Effects of the reading that the base model imitates to first order,
+    or has a longer delay in place of, are tried too, from the size of their prior. So are the classes of
+    linear dynamics, which a name must beat, if any name reaches a `rival` [nat]. What a few evaluations leave
+    far below that, or below the best candidate, is not refitted to the end: its evidence is a lower bound.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
     worth = {one.name: one.signature for one in named if one.log_bayes_factor > 0}
@@ -145,8 +145,7 @@ def _begun(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> list
         if (far or traced.card.dynamics) and movable(traced):
             effect, reached_at = descended(state, seen, traced)
             amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
-        # of what the plant imitates to first order a linear estimate says nothing
-        blind = traced.signature.survival < SEEN
+        blind = traced.signature.survival < SEEN or traced.card.delays
         promised = np.inf if blind else traced.signature.drop(seen.residual, seen.scale)
         starts = [(effect, amplitude, promised)]
         settled = reached_at is not None or traced.card.dynamics
@@ -194,11 +193,16 @@ def other_instance(seen: Trace, traced: Traced, least: float) -> Signature | Non
 
 
 def _blind(seen: Trace) -> list[Traced]:
-    """Effects of the reading that the base model imitates to first order: a refit may still show them."""
+    """Effects of the reading of which a linear estimate says nothing, and only a refit what they are worth:
+    those that the base model imitates to first order, and those that look like a delay, beside a delay that
+    is too long by theirs."""
     return [
         one
         for one in seen.traced
-        if one.card.place == "output" and 0 < one.survival < SEEN and len(one.signatures) == 1
+        if one.card.place == "output"
+        and len(one.signatures) == 1
+        and one.survival > 0
+        and (one.survival < SEEN or one.card.delays)
     ]
 
 
