@@ -115,13 +115,14 @@ def explained_draws(
     usable: Callable[[Draws, Noise], bool],
     *,
     near: Mapping[str, float] | None = None,
+    along: Sequence[Mapping[str, float]] = (),
     jobs: int = 1,
     quick: bool = False,
 ) -> tuple[Draws, Noise] | None:
     """Draws of an explained study, of the posterior that a fit of it samples and limited by the width of its
     blocks as there, and its noise; None where neither a search over orders, delays and noise nor importance
     sampling around optima holds, and a fit takes ensembles. Parameters by name `near` an optimum spare the
-    search for it.
+    search for it; `along` are those of further points about which the posterior is.
 
     Where normal draws about its optimum are not `usable` these are returned: the posterior is around there,
     and takes some ten thousand simulations.
@@ -139,6 +140,8 @@ def explained_draws(
     about = normal_draws(problem.posterior, optima[0], study.seed) if optima else None
     if about is not None and not usable(about, noise):
         return about, noise
+    points = (known_optimum(problem.posterior, _values(problem.posterior, one)) for one in along)
+    optima = (*optima, *(one for one in points if one is not None))
     result = _sampled(problem, optima, jobs=jobs, quick=quick)
     if result is None:
         return None

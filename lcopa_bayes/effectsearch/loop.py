@@ -347,9 +347,10 @@ class _Judged:
             return not astray(self.after, Side.drawn(problem, state, (draws, noise)))
 
         explained = explained_study(problem.study, state.model, self.begun.outliers)
-        values = state.model.values(state.optimum.x).tolist()
-        known = dict(zip(state.model.posterior.table.names, values, strict=True))
-        draws = explained_draws(explained, usable, near=known, jobs=jobs, quick=quick)
+        points = [state.optimum.x, *(state.valley.aside(state.optimum) if state.valley else ())]
+        names = state.model.posterior.table.names
+        known, *along = (dict(zip(names, state.model.values(x).tolist(), strict=True)) for x in points)
+        draws = explained_draws(explained, usable, near=known, along=along, jobs=jobs, quick=quick)
         return None if draws is None else Side.drawn(problem, state, draws)
 
     def _weighed(self, loop: Loop, options: _Options) -> Loop:

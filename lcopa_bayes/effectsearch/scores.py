@@ -17,7 +17,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noiselaw import Law
 from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.residualnoise import BandScales, ResidualNoise
-from lcopa_bayes.effectsearch.valley import Valley
+from lcopa_bayes.effectsearch.valley import Valley, valley_of
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.observations import Samples
@@ -112,11 +112,11 @@ class State:
     """Covariance of the coordinates in these draws, or with internal constants of effects free, (k, k); None
     where that of the optimum is all."""
 
-    @cached_property
+    @property
     def valley(self) -> Valley | None:
         """The valley of the posterior that a coefficient of an effect leads along and no normal about the
         optimum follows; None where there is none."""
-        return Valley.of(self.model, self.optimum, self.whitening)
+        return valley_of(self.model, self.optimum, self.whitening)
 
     @cached_property
     def residual_noise(self) -> tuple[ResidualNoise, ...]:

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple, Self, final
+from functools import lru_cache, partial
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -33,6 +33,8 @@ _FIRST, _RISE, _STEPS = 0.5, 0.6, (0.5, 2.0)
 most [-]."""
 _HIGH = 6.0
 """Rise of the cost above the lowest at which a valley ends [nat]."""
+_NEAR = 4.0
+"""How far below the largest the density is, at most, where a point of the floor counts [nat]."""
 _MOST = 16
 """Steps to either side [-]."""
 _EVALUATIONS, _GAIN = 10, 0.02
@@ -53,24 +55,6 @@ class Valley:
     """Optima given its value, by rising value."""
     about: tuple[SidedNormal, ...]
     """What each leaves open of the others."""
-
-    @classmethod
-    def of(cls, model: ExtendedModel, optimum: Optimum, whitening: Whitening) -> Self | None:
-        """That of the coefficient along which the cost about an optimum is least that of a normal; None where
-        it is that of one along all."""
-        regression = Regression(model, whitening)
-        unlike = {k: _unlike(regression, optimum, k) for k in _shared(model)}
-        known = max(unlike, key=unlike.__getitem__, default=None)
-        if known is None or unlike[known] < np.log(_UNLIKE):
-            return None
-        below, above = (list(_along(regression, optimum, known, side)) for side in (-1.0, 1.0))
-        floor = (*reversed(below), optimum, *above)
-        if len(floor) == 1:
-            return None
-        about = tuple(
-            SidedNormal.about(one, model.spread, regression.rises(one.cost), known) for one in floor
-        )
-        return cls(model, known, floor, about)
 
     @property
     def values(self) -> Vector:
@@ -101,6 +85,12 @@ class Valley:
                 shift[own] = normal.inside(supported, rng, own.size)
         return FloorDraws(middle, least, shift)
 
+    def aside(self, optimum: Optimum) -> list[Vector]:
+        """Coordinates of those points of the floor beside an optimum that its draws are about, (k,) each."""
+        level = self.log_density
+        pairs = zip(self.floor, level > level.max() - _NEAR, strict=True)
+        return [one.x for one, counts in pairs if counts and one is not optimum]
+
     def _supported(self, place: int, shift: Matrix) -> Flags:
         return self.model.inside(self.floor[place].x + shift)
 
@@ -115,6 +105,23 @@ class FloorDraws(NamedTuple):
     """Cost there, (draws,) [nat]."""
     shift: Matrix
     """From them, (draws, k)."""
+
+
+@lru_cache(maxsize=2)
+def valley_of(model: ExtendedModel, optimum: Optimum, whitening: Whitening) -> Valley | None:
+    """That of the coefficient along which the cost about an optimum is least that of a normal; None where it
+    is that of one along all."""
+    regression = Regression(model, whitening)
+    unlike = {k: _unlike(regression, optimum, k) for k in _shared(model)}
+    known = max(unlike, key=unlike.__getitem__, default=None)
+    if known is None or unlike[known] < np.log(_UNLIKE):
+        return None
+    below, above = (list(_along(regression, optimum, known, side)) for side in (-1.0, 1.0))
+    floor = (*reversed(below), optimum, *above)
+    if len(floor) == 1:
+        return None
+    about = (SidedNormal.about(one, model.spread, regression.rises(one.cost), known) for one in floor)
+    return Valley(model, known, floor, tuple(about))
 
 
 def _shared(model: ExtendedModel) -> list[int]:

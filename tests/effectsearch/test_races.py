@@ -12,7 +12,7 @@ from test_loop import LIBRARY, study
 from lcopa_bayes.core.crew import ALONE
 from lcopa_bayes.effectsearch import candidates, effectpairs, rounds
 from lcopa_bayes.effectsearch.basemodel import fitted_base
-from lcopa_bayes.effectsearch.candidates import followed, refitted
+from lcopa_bayes.effectsearch.candidates import _blind, followed, refitted
 from lcopa_bayes.effectsearch.effectpairs import paired
 from lcopa_bayes.effectsearch.refits import Refit, begun, ended, refit
 from lcopa_bayes.effectsearch.rounds import Round, _one_by_one
@@ -150,3 +150,20 @@ def test_a_pair_that_begins_far_below_what_is_to_be_beaten_is_left_out(monkeypat
     taken.clear()
     assert paired(first.state, first.state, first.trace) is None
     assert not taken
+
+
+@pytest.mark.parametrize(
+    ("survival", "tried"),
+    [
+        (0.0, []),
+        (0.02, ["cross_fade", "exposure", "sensor_lag", "odd_curvature"]),
+        (0.6, ["cross_fade", "exposure", "sensor_lag"]),
+    ],
+)
+def test_what_looks_like_a_delay_is_tried_whatever_its_linear_estimate(
+    survival: float, tried: list[str]
+) -> None:
+    """As what the plant imitates to first order is; not what has no signature at all, and no other effect."""
+    names = ("cross_fade", "exposure", "sensor_lag", "odd_curvature", "clock_skew", "cubic_stiffness")
+    seen = [SimpleNamespace(card=catalogue()[n].card, survival=survival, signatures=(None,)) for n in names]
+    assert [one.card.name for one in _blind(SimpleNamespace(traced=seen))] == tried

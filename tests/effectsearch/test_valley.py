@@ -15,12 +15,16 @@ from lcopa_bayes.bench.undeclared import campaign, drawn
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch import explained as explained_module
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.drawsabout import likely_draws
+from lcopa_bayes.effectsearch.explained import explained_draws, explained_study
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.sidednormal import SidedNormal
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.response import CrossFade, OddCurvature
 from lcopa_bayes.model.path import TransferPath
@@ -30,9 +34,8 @@ NOISE, COUNT = 0.03, 20000
 
 
 @cache
-def explained(effect: type[Effect]) -> State:
-    """One step of a lag whose centroid waits, its gain and order known, with an effect at its optimum: how
-    late the response is, its delay and the effect share."""
+def studied() -> Study:
+    """One step of a lag whose centroid waits, its gain and order known."""
     time = np.arange(0.0, 30.0, 0.25)
     part = np.where(time > 7.0, unit_step(LAG, np.maximum(time - 7.0, 1e-9)), 0.0)
     new, old = np.sinc(1 - part) ** 2, np.sinc(part) ** 2
@@ -43,10 +46,13 @@ def explained(effect: type[Effect]) -> State:
     known = {"gain": 1.0, "offset": 0.0, "order_1": 1.0}
     priors = {name: PriorSettings(name, fixed=value) for name, value in known.items()}
     model = ModelSettings(terms=1, offset="shared")
-    base = fitted_base(
-        Study("valley", None, "s", 3, (made,), (), model, priors=priors), (), as_stated=True, draws=100
-    )
-    start = base.start
+    return Study("valley", None, "s", 3, (made,), (), model, priors=priors)
+
+
+@cache
+def explained(effect: type[Effect]) -> State:
+    """The same with an effect at its optimum: how late the response is, its delay and the effect share."""
+    start = fitted_base(studied(), (), as_stated=True, draws=100).start
     added = [(effect(), np.array([0.5]))]
     return refit(start.model, start.optimum, start.whitening, added, 100.0).state
 
@@ -107,6 +113,27 @@ def test_the_floor_is_the_least_cost_at_its_value() -> None:
     assert_allclose(regression.costs(middle), least, atol=0.1)
     assert (regression.rises(0.0)(middle + shift) > least - 0.1).all()
     assert least.max() < state.optimum.cost + 6 + 1.5
+
+
+def test_points_along_it_are_where_draws_are_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the floor whose density counts, the optimum first, beside the noise of their residuals."""
+    state = explained(CrossFade)
+    assert state.valley is not None
+    found: list[Optimum] = []
+    monkeypatch.setattr(explained_module, "_sampled", lambda _, optima, **options: found.extend(optima))
+    aside = state.valley.aside(state.optimum)
+    names = state.model.posterior.table.names
+    near, *along = (
+        dict(zip(names, state.model.values(x).tolist(), strict=True)) for x in (state.optimum.x, *aside)
+    )
+    study = explained_study(studied(), state.model)
+    assert explained_draws(study, lambda *_: True, near=near, along=along) is None
+    place = problem_of(study).posterior.table.names.index("cross_fade.strength")
+    sizes = np.array([one.values[place] for one in found])
+    assert_allclose(sizes[1:], [x[2] for x in aside], rtol=1e-6)
+    assert sizes[0] == pytest.approx(state.optimum.x[2], abs=0.1 * state.optimum.sd[2])
+    assert len(aside) > 4
+    assert np.ptp(sizes) > 3 * state.optimum.sd[2]
 
 
 def test_of_a_normal_posterior_there_is_none() -> None:
