@@ -272,7 +272,7 @@ def begun(
     extended = widened(extended, added)
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
-    if any(map(_like_a_delay, (effect for effect, _ in added))):
+    if any(effect.card.place == "drive" or effect.card.delays for effect, _ in added):
         starts += [model.delayed(starts[0], share) for share in _DELAYS]
     starts = [near, *starts] if near is not None else starts
     starts = [np.clip(start, low, high) for start in starts]  # starts only
@@ -296,15 +296,10 @@ def ended(one: Refit) -> Refit:
         model, start = freed(model, start, white, names)
     exact = Regression(model, white)
     optimum = exact.descend(start, most=12, gain=0.02)
-    if any(_like_a_delay(effect) for effect in model.effects if effect.name in names):
+    if any(effect.card.delays for effect in model.effects if effect.name in names):
         optimum = min([optimum, *_earlier(exact, optimum)], key=lambda other: other.cost)
     model, optimum = with_room(model, _no_worse(model, white, optimum, before), white, names)
     return replace(one, model=model, optimum=optimum, glances=())
-
-
-def _like_a_delay(effect: Effect) -> bool:
-    """Whether a plant without the effect has another delay in its place."""
-    return effect.card.place == "drive" or effect.card.delays
 
 
 def _earlier(regression: Regression, optimum: Optimum) -> Iterator[Optimum]:

@@ -173,16 +173,12 @@ class Regression:
             raise FloatingPointError("the simulated response is not finite")
         least, enough = self.model.least(self.whitening.held), 2 * gain / self.whitening.size
         low, high = self.model.bounds_about(x)
-        ends = _wider(low, high)
-        ends[0][k], ends[1][k] = (
-            value - _AT_ONE * self.model.spread[k],
-            value + _AT_ONE * self.model.spread[k],
-        )
-        found = np.clip(
-            least.search(x, self.model.template, ends, evaluations=most, enough=enough).x, low, high
-        )
+        ends, room = _wider(low, high), _AT_ONE * self.model.spread[k]
+        ends[0][k], ends[1][k] = value - room, value + room
+        search = least.search(x, self.model.template, ends, evaluations=most, enough=enough)
+        found: Vector = np.clip(search.x, low, high)
         found[k] = value
-        return np.asarray(found)
+        return found
 
     def descend(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> Optimum:
         """The optimum of `reached`, described."""
