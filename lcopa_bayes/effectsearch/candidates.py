@@ -145,8 +145,7 @@ def _begun(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> list
         if (far or traced.card.dynamics) and movable(traced):
             effect, reached_at = descended(state, seen, traced)
             amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
-        blind = traced.signature.survival < SEEN or traced.card.delays
-        promised = np.inf if blind else traced.signature.drop(seen.residual, seen.scale)
+        promised = np.inf if _misjudged(traced) else traced.signature.drop(seen.residual, seen.scale)
         starts = [(effect, amplitude, promised)]
         settled = reached_at is not None or traced.card.dynamics
         other = None if settled else other_instance(seen, traced, least)
@@ -193,17 +192,18 @@ def other_instance(seen: Trace, traced: Traced, least: float) -> Signature | Non
 
 
 def _blind(seen: Trace) -> list[Traced]:
-    """Effects of the reading of which a linear estimate says nothing, and only a refit what they are worth:
-    those that the base model imitates to first order, and those that look like a delay, beside a delay that
-    is too long by theirs."""
+    """Effects of the reading that only a refit may show (`_misjudged`)."""
     return [
         one
         for one in seen.traced
-        if one.card.place == "output"
-        and len(one.signatures) == 1
-        and one.survival > 0
-        and (one.survival < SEEN or one.card.delays)
+        if one.card.place == "output" and len(one.signatures) == 1 and one.survival > 0 and _misjudged(one)
     ]
+
+
+def _misjudged(traced: Traced) -> bool:
+    """Whether a linear estimate says nothing of an effect: the plant imitates it to first order, or has a
+    longer delay in its place."""
+    return traced.signature.survival < SEEN or traced.card.delays
 
 
 def rough(seen: Trace) -> bool:

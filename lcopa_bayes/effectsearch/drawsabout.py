@@ -32,17 +32,16 @@ def likely_draws(state: State, rng: np.random.Generator, count: int) -> Matrix:
     """
     x, regression = state.optimum.x, Regression(state.model, state.whitening)
     if state.valley is None:
-        normal = SidedNormal.about(state.optimum, state.model.spread, regression.rises(state.optimum.cost))
+        normal = SidedNormal.about(state.optimum, state.model.spread, regression.costs_inside)
         shift = normal.inside(lambda shift: state.model.inside(x + shift), rng, count)
         middle, least = np.tile(x, (count, 1)), np.full(count, state.optimum.cost)
     else:
         middle, least, shift = state.valley.draws(rng, count)
-    costs = regression.rises(0.0)
     limit = float(chi2.isf(CHANCE, x.size)) / 2
     kept, left = np.full((count, x.size), np.nan), np.arange(count)
     for share in _NEARER:
         near = middle[left] + share * shift[left]
-        follow = costs(near) - least[left] <= limit
+        follow = regression.costs_inside(near) - least[left] <= limit
         kept[left[follow]] = near[follow]
         left = left[~follow]
     return np.concatenate([x[None], np.delete(kept, left, axis=0)])

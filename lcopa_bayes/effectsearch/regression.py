@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple, final
@@ -117,16 +117,12 @@ class Regression:
         portions = (many[k : k + _PORTION] for k in range(0, len(many), _PORTION))
         return np.concatenate([np.empty(0), *map(self._costs, portions)])
 
-    def rises(self, least: float) -> Callable[[Matrix], Vector]:
-        """Costs over the `least` at coordinates (batch, k), (batch,) [nat], infinite beyond the support."""
-
-        def rises(many: Matrix) -> Vector:
-            inside = self.model.inside(many)
-            out = np.full(len(many), np.inf)
-            out[inside] = self.costs(many[inside]) - least
-            return out
-
-        return rises
+    def costs_inside(self, many: Matrix) -> Vector:
+        """The same, infinite beyond the support."""
+        inside = self.model.inside(many)
+        out = np.full(len(many), np.inf)
+        out[inside] = self.costs(many[inside])
+        return out
 
     def _costs(self, many: Matrix) -> Vector:
         residual = self.whitening.observed - self.model.predictions(many)
@@ -146,10 +142,7 @@ class Regression:
 
         ArithmeticError when the response at the start is not finite or not bounded.
         """
-        x = np.clip(start, *self.model.bounds_about(start))  # a start only
-        cost = self.cost(x)
-        if not np.isfinite(cost):
-            raise FloatingPointError("the simulated response is not finite")
+        x, cost = self._begun(start)
         least, enough = self.model.least(self.whitening.held), 2 * gain / self.whitening.size
         for _ in range(_WALLS):
             low, high = self.model.bounds_about(x)
@@ -163,14 +156,20 @@ class Regression:
                 break  # else a wall between two orders moves with them
         return self.model.canonical(x), bool(search.status > 0)
 
+    def _begun(self, start: Vector) -> tuple[Vector, float]:
+        """A start inside its bounds, and its cost; FloatingPointError where that is not finite."""
+        x = np.clip(start, *self.model.bounds_about(start))  # a start only
+        cost = self.cost(x)
+        if not np.isfinite(cost):
+            raise FloatingPointError("the simulated response is not finite")
+        return x, cost
+
     def along(self, k: int, value: float, start: Vector, *, most: int, gain: float) -> Vector:
         """Coordinates of the optimum among those whose coordinate `k` has a `value`, after at most so many
         evaluations from a start; errors as of `reached`."""
         x = start.copy()
         x[k] = value
-        x = np.clip(x, *self.model.bounds_about(x))  # a start only
-        if not np.isfinite(self.cost(x)):
-            raise FloatingPointError("the simulated response is not finite")
+        x, _ = self._begun(x)
         least, enough = self.model.least(self.whitening.held), 2 * gain / self.whitening.size
         low, high = self.model.bounds_about(x)
         ends, room = _wider(low, high), _AT_ONE * self.model.spread[k]

@@ -23,8 +23,8 @@ _SHORTER, _SHORTEST, _LONGER = 0.05, 1e-4, 1e6
 """Factors by which a step along an axis is shortened at most, shares of the normal scale that end it, and
 factor over a step at which a cost has not risen."""
 
-Rises: TypeAlias = Callable[[Matrix], Vector]
-"""Cost over that of a point, infinite beyond the support, at coordinates (batch, k), (batch,) [nat]."""
+Costs: TypeAlias = Callable[[Matrix], Vector]
+"""Cost at coordinates (batch, k), infinite beyond the support, (batch,) [nat]."""
 
 
 @final
@@ -49,8 +49,8 @@ class SidedNormal:
     """Standard deviations below and above along each, (free, 2)."""
 
     @classmethod
-    def about(cls, optimum: Optimum, spread: Vector, rises: Rises, known: int | None = None) -> Self:
-        """Of an optimum of coordinates of a prior `spread`, (k,), from which the cost `rises`; with the
+    def about(cls, optimum: Optimum, spread: Vector, costs: Costs, known: int | None = None) -> Self:
+        """Of an optimum of coordinates of a prior `spread`, (k,), and the `costs` about it; with the
         coordinate `known` where it is, of the optimum given that."""
         given = np.arange(optimum.x.size) == known
         stuck, whole = optimum.stuck & ~given, optimum.covariance
@@ -58,13 +58,13 @@ class SidedNormal:
         if known is not None:
             whole = whole - np.outer(whole[known], whole[known]) / whole[known, known]
         onto = whole[np.ix_(free, stuck)] @ np.linalg.pinv(whole[np.ix_(stuck, stuck)])
-        whole_free = whole[np.ix_(free, free)] - onto @ whole[np.ix_(stuck, free)]
-        power, own = np.linalg.eigh(whole_free / np.outer(spread[free], spread[free]))
+        others = whole[np.ix_(free, free)] - onto @ whole[np.ix_(stuck, free)]
+        power, own = np.linalg.eigh(others / np.outer(spread[free], spread[free]))
         axes = np.zeros((own.shape[0], stuck.size))
         axes[:, free] = (own * spread[free, None]).T
         sides = np.stack([-axes, axes], axis=1).reshape(-1, stuck.size)
         scales = _scales(
-            lambda step, which: rises(optimum.x + step[:, None] * sides[which]),
+            lambda step, which: costs(optimum.x + step[:, None] * sides[which]) - optimum.cost,
             np.repeat(np.sqrt(np.maximum(power, 0.0)), 2),
         )
         slope, sd = (optimum.jacobian.T @ optimum.white)[stuck], np.sqrt(np.diag(whole)[stuck])

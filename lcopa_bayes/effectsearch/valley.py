@@ -120,7 +120,7 @@ def valley_of(model: ExtendedModel, optimum: Optimum, whitening: Whitening) -> V
     floor = (*reversed(below), optimum, *above)
     if len(floor) == 1:
         return None
-    about = (SidedNormal.about(one, model.spread, regression.rises(one.cost), known) for one in floor)
+    about = (SidedNormal.about(one, model.spread, regression.costs_inside, known) for one in floor)
     return Valley(model, known, floor, tuple(about))
 
 
@@ -143,16 +143,15 @@ def _unlike(regression: Regression, optimum: Optimum, k: int) -> float:
             there = _given(regression, k, value, x + side * towards)
         except ArithmeticError:  # no bounded response
             continue
-        rise = max(there.cost - optimum.cost, 1e-3)
+        rise = max(regression.cost(there) - optimum.cost, 1e-3)
         out.append(abs(float(np.log(rise / (0.5 * side**2)))))
     return max(out)
 
 
-def _given(regression: Regression, k: int, value: float, start: Vector) -> Optimum:
-    """The optimum given the value of a coordinate, described."""
+def _given(regression: Regression, k: int, value: float, start: Vector) -> Vector:
+    """Coordinates of the optimum given the value of one."""
     start = np.clip(start, *regression.model.bounds)  # a start only
-    x = regression.along(k, value, start, most=_EVALUATIONS, gain=_GAIN)
-    return regression.at(x)
+    return regression.along(k, value, start, most=_EVALUATIONS, gain=_GAIN)
 
 
 def _along(regression: Regression, optimum: Optimum, k: int, side: float) -> Iterator[Optimum]:
@@ -166,7 +165,7 @@ def _along(regression: Regression, optimum: Optimum, k: int, side: float) -> Ite
         if value == last.x[k]:
             return
         try:
-            there = _given(regression, k, value, last.x + (value - last.x[k]) * slope)
+            there = regression.at(_given(regression, k, value, last.x + (value - last.x[k]) * slope))
         except ArithmeticError:  # no bounded response
             return
         yield there

@@ -165,5 +165,9 @@ def test_what_looks_like_a_delay_is_tried_whatever_its_linear_estimate(
 ) -> None:
     """As what the plant imitates to first order is; not what has no signature at all, and no other effect."""
     names = ("cross_fade", "exposure", "sensor_lag", "odd_curvature", "clock_skew", "cubic_stiffness")
-    seen = [SimpleNamespace(card=catalogue()[n].card, survival=survival, signatures=(None,)) for n in names]
+    own = SimpleNamespace(survival=survival)
+    seen = [
+        SimpleNamespace(card=catalogue()[name].card, survival=survival, signature=own, signatures=(own,))
+        for name in names
+    ]
     assert [one.card.name for one in _blind(SimpleNamespace(traced=seen))] == tried

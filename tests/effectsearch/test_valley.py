@@ -111,7 +111,7 @@ def test_the_floor_is_the_least_cost_at_its_value() -> None:
     middle, least, shift = valley.draws(np.random.default_rng(2), 300)
     assert_allclose(shift[:, valley.known], 0.0, atol=1e-12)
     assert_allclose(regression.costs(middle), least, atol=0.1)
-    assert (regression.rises(0.0)(middle + shift) > least - 0.1).all()
+    assert (regression.costs_inside(middle + shift) > least - 0.1).all()
     assert least.max() < state.optimum.cost + 6 + 1.5
 
 
@@ -153,12 +153,12 @@ def test_volumes_are_those_of_the_normal_given_a_coordinate() -> None:
     precision = np.linalg.inv(optimum.covariance)
     free = replace(optimum, stuck=np.zeros(3, dtype=bool))
 
-    def rises(many: np.ndarray) -> np.ndarray:
-        return 0.5 * np.einsum("bk,kl,bl->b", many - x, precision, many - x)
+    def costs(many: np.ndarray) -> np.ndarray:
+        return optimum.cost + 0.5 * np.einsum("bk,kl,bl->b", many - x, precision, many - x)
 
-    whole = SidedNormal.about(free, state.model.spread, rises)
+    whole = SidedNormal.about(free, state.model.spread, costs)
     assert whole.log_volume == pytest.approx(0.5 * np.linalg.slogdet(2 * np.pi * optimum.covariance)[1])
-    given = SidedNormal.about(free, state.model.spread, rises, known=1)
+    given = SidedNormal.about(free, state.model.spread, costs, known=1)
     others = np.linalg.inv(precision[np.ix_([0, 2], [0, 2])])
     assert given.log_volume == pytest.approx(0.5 * np.linalg.slogdet(2 * np.pi * others)[1])
     shift = given.draw(np.random.default_rng(3), COUNT)
